@@ -1,0 +1,238 @@
+"""Every tunable once: typed, with default, unit, range and help. YAML files, ROS parameters, command-line overrides and
+checkpoints derive from these dataclasses.
+
+A setting's public name is its field's name, with the group's name before it where the group is nested:
+`beta`, `num_worlds`, `reward_network.hidden_size`. A task file is a ROS 2 parameter file (`/**: ros__parameters:`), so
+the same file serves `--params-file` and `bringup`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Iterator, Mapping, get_type_hints
+
+import yaml
+
+from dae_ros.errors import SettingsError
+
+
+def setting(default, help_text: str, *, unit: str = '', minimum=None, maximum=None, choices: tuple[str, ...] = ()):
+    """A dataclass field that knows its help, unit, range and choices."""
+    metadata = {'help': help_text, 'unit': unit, 'minimum': minimum, 'maximum': maximum, 'choices': choices}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """What is simulated. World and trainer need it."""
+
+    task: str = setting('navigation', "navigation, formation, line, matrix_game, or pettingzoo:MODULE for a PettingZoo "
+                                      "parallel environment with discrete actions, e.g. pettingzoo:mpe2.simple_spread_v3")
+    num_agents: int = setting(3, 'robots of the team (N)', unit='robots', minimum=1, maximum=1000)
+    num_worlds: int = setting(128, 'worlds simulated side by side (W); a real team has 1', unit='worlds',
+                              minimum=1, maximum=65536)
+    episode_steps: int = setting(0, 'steps after which an episode ends; 0 takes the task\'s own (25 in the particle tasks, '
+                                    'N in the matrix game)', unit='steps', minimum=0, maximum=1_000_000)
+    observe_others: bool = setting(False, 'formation and line: each robot also observes the other robots\' relative positions')
+
+
+@dataclass(frozen=True)
+class RewardNetworkSettings:
+    """The learnt reward behind the credit (paper section 3.3). Unused at beta = 0."""
+
+    hidden_size: int = setting(128, 'width of the reward network', unit='units', minimum=1, maximum=4096)
+    ensemble_size: int = setting(1, 'networks averaged: 1 as in the paper, 2 as in its authors\' code', minimum=1, maximum=16)
+    learning_rate: float = setting(7e-4, 'step size of the reward network\'s Adam', minimum=0.0, maximum=1.0)
+    epochs: int = setting(10, 'passes over a rollout per update', minimum=1, maximum=1000)
+
+
+@dataclass(frozen=True)
+class LearnerSettings:
+    """Recurrent MAPPO with DAE. Only the trainer needs it. Defaults: the paper's appendix C and its authors' code."""
+
+    beta: float = setting(0.95, 'credit against bias: 0 is GAE (plain MAPPO), 1 difference rewards', minimum=0.0, maximum=1.0)
+    gamma: float = setting(0.99, 'discount per step', minimum=0.0, maximum=1.0)
+    gae_lambda: float = setting(0.95, 'bias against variance of the advantages (lambda of GAE)', minimum=0.0, maximum=1.0)
+    value_target: str = setting('difference', 'what the critic regresses on: A + V with the credit baseline subtracted, as '
+                                              'in the authors\' code, or the plain lambda return, as in the paper\'s appendix B',
+                                choices=('difference', 'gae'))
+    hidden_size: int = setting(64, 'width of actor and critic', unit='units', minimum=1, maximum=4096)
+    mlp_layers: int = setting(2, 'hidden layers before the recurrent one in actor and critic', minimum=1, maximum=8)
+    activation: str = setting('relu', 'activation of actor and critic', choices=('relu', 'tanh'))
+    learning_rate: float = setting(7e-4, 'step size of Adam for actor and critic', minimum=0.0, maximum=1.0)
+    adam_epsilon: float = setting(1e-5, 'epsilon of Adam', minimum=1e-12, maximum=1.0)
+    epochs: int = setting(10, 'passes over a rollout per update', minimum=1, maximum=1000)
+    num_mini_batches: int = setting(1, 'parts a rollout is split into per epoch', minimum=1, maximum=1024)
+    chunk_length: int = setting(10, 'steps backpropagated through time', unit='steps', minimum=1, maximum=10_000)
+    clip: float = setting(0.2, 'clip range of the probability ratio and of the value', minimum=0.0, maximum=10.0)
+    entropy_coefficient: float = setting(0.01, 'weight of the entropy bonus', minimum=0.0, maximum=10.0)
+    value_coefficient: float = setting(1.0, 'weight of the value loss', minimum=0.0, maximum=100.0)
+    huber_delta: float = setting(10.0, 'where the value loss turns from quadratic to linear, on normalised values',
+                                 minimum=1e-6, maximum=1e6)
+    max_gradient_norm: float = setting(10.0, 'gradients longer than this are shortened, per network', minimum=1e-6, maximum=1e9)
+    learner_threads: int = setting(0, 'processor threads of the learner; 0 takes all cores. The weights do not depend on it',
+                                   minimum=0, maximum=1024)
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """How long a run is and what it leaves. Only the trainer needs it."""
+
+    seed: int = setting(1, 'seed of the run: same seed, same weights', minimum=0, maximum=2**63 - 1)
+    total_steps: int = setting(1_000_000, 'environment steps to train for, all worlds together', unit='steps',
+                               minimum=1, maximum=10**12)
+    num_steps: int = setting(25, 'steps of a rollout (T); every rollout begins with new episodes', unit='steps',
+                             minimum=1, maximum=1000)
+    rollout_timeout: float = setting(30.0, 'without any message for this long a rollout is begun anew', unit='s',
+                                     minimum=0.1, maximum=86_400.0)
+    evaluation_episodes: int = setting(512, 'fresh episodes played with the trained team at the end; 0 for none',
+                                       unit='episodes', minimum=0, maximum=1_000_000)
+    evaluation_greedy: bool = setting(True, 'evaluate with each robot\'s most probable action instead of a drawn one')
+    checkpoint_interval: int = setting(10, 'updates between checkpoints', unit='updates', minimum=1, maximum=1_000_000)
+    keep_checkpoints: int = setting(3, 'newest checkpoints and policy versions kept on disk', minimum=1, maximum=1_000_000)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All settings of a run, by group. `flatten` gives them by their public names."""
+
+    task: TaskSettings = field(default_factory=TaskSettings)
+    learner: LearnerSettings = field(default_factory=LearnerSettings)
+    reward_network: RewardNetworkSettings = field(default_factory=RewardNetworkSettings)
+    run: RunSettings = field(default_factory=RunSettings)
+
+
+NESTED_GROUPS = ('reward_network',)
+
+
+class SettingInfo:
+    """One setting's declaration: where it lives and what it may be."""
+
+    def __init__(self, group: str, declared: dataclasses.Field, kind: type):
+        self.group = group
+        self.attribute = declared.name
+        self.name = f'{group}.{declared.name}' if group in NESTED_GROUPS else declared.name
+        self.kind = kind
+        self.default = declared.default
+        self.help = declared.metadata['help']
+        self.unit = declared.metadata['unit']
+        self.minimum = declared.metadata['minimum']
+        self.maximum = declared.metadata['maximum']
+        self.choices = declared.metadata['choices']
+
+    def check(self, value: Any) -> Any:
+        """`value` as this setting's type; an integer is a fine float, nothing else is converted.
+
+        Raises SettingsError naming the setting, the value and what is allowed.
+        """
+        if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not self.kind:
+            raise SettingsError(f'{self.name} must be {_ARTICLES[self.kind]}, not {value!r}')
+        if self.choices and value not in self.choices:
+            raise SettingsError(f'{self.name} must be one of {", ".join(self.choices)}, not {value!r}')
+        if self.minimum is not None and not self.minimum <= value <= self.maximum:
+            raise SettingsError(f'{self.name} must lie in {self.minimum} .. {self.maximum}, not {value!r}')
+        return value
+
+    def describe(self) -> str:
+        """Help text with unit and choices, as ROS parameter descriptions and `--help` show it."""
+        unit = f' [{self.unit}]' if self.unit else ''
+        choices = f' ({" | ".join(self.choices)})' if self.choices else ''
+        return f'{self.help}{unit}{choices}'
+
+
+_ARTICLES = {int: 'an integer', float: 'a number', bool: 'true or false', str: 'a text'}
+
+
+def declared_settings() -> Iterator[SettingInfo]:
+    """Every setting's declaration, in the order of the dataclasses."""
+    for group in dataclasses.fields(Settings):
+        group_class = get_type_hints(Settings)[group.name]
+        kinds = get_type_hints(group_class)
+        for declared in dataclasses.fields(group_class):
+            yield SettingInfo(group.name, declared, kinds[declared.name])
+
+
+SETTINGS: dict[str, SettingInfo] = {info.name: info for info in declared_settings()}
+
+
+def unknown_setting(name: str, known: Mapping[str, Any] | tuple[str, ...]) -> SettingsError:
+    """The error for a key nobody declared, with the nearest name there is."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    hint = f'; did you mean {near[0]!r}?' if near else ''
+    return SettingsError(f'unknown setting {name!r}{hint}')
+
+
+def from_flat(values: Mapping[str, Any], base: Settings = Settings()) -> Settings:
+    """`base` with `values`, given by public names, put in. Raises SettingsError on an unknown key or a bad value."""
+    changed: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        if name not in SETTINGS:
+            raise unknown_setting(name, SETTINGS)
+        info = SETTINGS[name]
+        changed.setdefault(info.group, {})[info.attribute] = info.check(value)
+    groups = {group: dataclasses.replace(getattr(base, group), **fields) for group, fields in changed.items()}
+    return dataclasses.replace(base, **groups)
+
+
+def flatten(settings: Settings) -> dict[str, Any]:
+    """Every setting by its public name."""
+    return {name: getattr(getattr(settings, info.group), info.attribute) for name, info in SETTINGS.items()}
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """`name:=value` as ROS writes it; the value is read as YAML."""
+    name, separator, value = text.partition(':=')
+    if not separator or not name:
+        raise SettingsError(f'expected name:=value, not {text!r}')
+    return name, yaml.safe_load(value)
+
+
+def load_task_file(path: str | Path) -> dict[str, Any]:
+    """The settings a task file sets, by public names, not yet checked.
+
+    Raises SettingsError if the file cannot be read or is not of the form `/**: ros__parameters: {...}`.
+    """
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise SettingsError(f'cannot read the task file {path}: {error.strerror}') from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise SettingsError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
+    try:
+        (node, body), = content.items()
+        (key, parameters), = body.items()
+    except (AttributeError, ValueError) as error:
+        raise SettingsError(f'{path} must have the one key /**: and under it ros__parameters:') from error
+    if node != '/**' or key != 'ros__parameters' or not isinstance(parameters, dict):
+        raise SettingsError(f'{path} must have the one key /**: and under it ros__parameters:')
+    return dict(_flat_items(parameters))
+
+
+def _flat_items(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat_items(value, f'{prefix}{key}.')
+        else:
+            yield f'{prefix}{key}', value
+
+
+def to_yaml(settings: Settings) -> str:
+    """`settings` as a task file that `load_task_file` reads back."""
+    nested: dict[str, Any] = {}
+    for name, value in flatten(settings).items():
+        group, _, rest = name.rpartition('.')
+        (nested.setdefault(group, {}) if group else nested)[rest] = value
+    return yaml.safe_dump({'/**': {'ros__parameters': nested}}, sort_keys=False)
+
+
+def digest(settings: Settings) -> str:
+    """SHA-256 of all settings: two runs with the same digest end with the same weights."""
+    return hashlib.sha256(json.dumps(flatten(settings), sort_keys=True).encode()).hexdigest()

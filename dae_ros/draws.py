@@ -1,0 +1,23 @@
+"""Random draws keyed by what they are for, so that a run's data do not depend on who draws first or how often.
+
+A draw is named by the run's seed, a purpose ('reset', 'action', ...) and the indices it belongs to (rollout, step,
+robot). The name is hashed to the key of a counter-based generator (Philox 4x64; Salmon et al., SC 2011): the same
+name gives the same numbers in any process, in any order, on any attempt.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+
+def key(seed: int, purpose: str, *indices: int) -> int:
+    """128-bit key of the draw named by `seed`, `purpose` and `indices`."""
+    name = f'{seed}/{purpose}/' + '/'.join(str(int(index)) for index in indices)
+    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=16).digest(), 'little')
+
+
+def generator(seed: int, purpose: str, *indices: int) -> np.random.Generator:
+    """A generator of its own for the draw named by `seed`, `purpose` and `indices`."""
+    return np.random.Generator(np.random.Philox(key=key(seed, purpose, *indices)))

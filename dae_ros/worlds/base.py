@@ -1,0 +1,50 @@
+"""What a batch of simulated worlds must do, and nothing about how.
+
+A `Worlds` object steps W independent worlds at once. It holds no random state: every draw is keyed by the run's seed,
+the rollout and the step (`dae_ros.draws`), so that a rollout can be begun again from its request alone.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+
+from dae_ros.types import WorldSpec
+
+
+class JointObservation(NamedTuple):
+    """What W worlds show before a joint action."""
+
+    observations: np.ndarray   # [W, N, O] float32
+    state: np.ndarray          # [W, S] float32
+    episode_start: np.ndarray  # [W] bool
+
+
+class Transition(NamedTuple):
+    """What a joint action did. Worlds whose episode ended have begun the next one: `next` is its first step."""
+
+    reward: np.ndarray         # [W] float32, shared by the team
+    terminated: np.ndarray     # [W] bool
+    truncated: np.ndarray      # [W] bool, never both
+    final_states: np.ndarray   # [K, S] float32, last states of the K truncated episodes, in the order of the worlds
+    next: JointObservation
+
+
+class Worlds(ABC):
+    """W worlds of one task."""
+
+    spec: WorldSpec
+    num_worlds: int
+
+    @abstractmethod
+    def reset(self, seed: int, rollout: int) -> JointObservation:
+        """Begin a new episode in every world, keyed by the run's seed and the rollout."""
+
+    @abstractmethod
+    def step(self, actions: np.ndarray) -> Transition:
+        """Apply the joint actions, integers [W, N] in 0 .. A-1; worlds whose episode ends begin the next one."""
+
+    def close(self) -> None:
+        """Release what the worlds hold outside Python's memory."""
