@@ -1,0 +1,47 @@
+"""Advantage estimators as pure functions on tensors: GAE and the credit baseline that makes it DAE.
+
+A step's `continues` is 1 where its episode goes on to the next step of the rollout and 0 where it ended with this step,
+for good or by being cut off. `next_values` is the value of what came after the step: V of the next state, V of the
+final state where the episode was cut off, 0 where it ended for good.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def generalized_advantages(rewards: Tensor, values: Tensor, next_values: Tensor, continues: Tensor,
+                           gamma: float, gae_lambda: float) -> Tensor:
+    """GAE (eq. 5), shared by the team: G_t = delta_t + gamma lambda c_t G_{t+1}. All tensors [T, W]."""
+    deltas = rewards + gamma * next_values - values
+    return _discounted_sum(deltas, gamma * gae_lambda * continues)
+
+
+def credit_baselines(expected_rewards: Tensor, continues: Tensor, beta: float, gamma: float, gae_lambda: float) -> Tensor:
+    """What DAE subtracts from the team's GAE for each agent: B_t = beta e_t + gamma lambda beta c_t B_{t+1}.
+
+    expected_rewards: e [T, W, N], the reward averaged over the agent's own action. continues: [T, W]. Returns [T, W, N].
+    This is eq. (18)'s sum over -beta^{l+1} E[r_{t+l}] (l counts from t, hence the extra beta in the recursion).
+    """
+    return _discounted_sum(beta * expected_rewards, (gamma * gae_lambda * beta * continues).unsqueeze(-1))
+
+
+def expected_rewards(predicted: Tensor, probabilities: Tensor) -> Tensor:
+    """E over a_i ~ pi_i of the predicted reward: both [..., A], the acting policy's whole distribution. Returns [...]."""
+    return (predicted * probabilities).sum(-1)
+
+
+def normalized(advantages: Tensor) -> Tensor:
+    """Mean 0 and deviation 1 over everything."""
+    return (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-5)
+
+
+def _discounted_sum(terms: Tensor, factors: Tensor) -> Tensor:
+    """x_t = terms_t + factors_t x_{t+1}, from the last step backwards."""
+    result = torch.empty_like(terms)
+    carried = torch.zeros_like(terms[0])
+    for t in reversed(range(len(terms))):
+        carried = terms[t] + factors[t] * carried
+        result[t] = carried
+    return result

@@ -1,0 +1,41 @@
+"""Cuts a rollout into the pieces the networks are trained on.
+
+The worlds' sequences are laid end to end and cut every `chunk_length` steps; a chunk may run over the end of an episode
+into the next one, where the recurrent state is zeroed anyway. Chunks are grouped into shards of a size that depends on
+the data alone: gradients are summed shard by shard in a fixed order, whichever thread computes them, so the weights do
+not depend on the machine's number of cores.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+SHARD_ROWS = 256  # rows of a recurrent step that fill the arithmetic units and still leave the shard in the cache
+
+
+def to_chunks(sequences: Tensor, length: int) -> Tensor:
+    """[T, W, ...] -> [L, C, ...] with C = ceil(T W / L); what is missing at the end is filled with zeros."""
+    steps, worlds = sequences.shape[:2]
+    flat = sequences.transpose(0, 1).reshape(steps * worlds, *sequences.shape[2:])
+    missing = -len(flat) % length
+    if missing:
+        flat = torch.cat([flat, flat.new_zeros(missing, *flat.shape[1:])])
+    return flat.view(-1, length, *flat.shape[1:]).transpose(0, 1)
+
+
+def first_states(states: Tensor, length: int) -> Tensor:
+    """Recurrent state before the first step of every chunk.
+
+    states: [T, W, ...], the state after each step. Returns [C, ...]; before the first step of a world it is zero.
+    """
+    before = torch.cat([torch.zeros_like(states[:1]), states[:-1]])
+    return to_chunks(before, length)[0]
+
+
+def shard_bounds(columns: int, rows_per_column: int) -> list[tuple[int, int]]:
+    """Splits `columns` chunks or worlds of `rows_per_column` rows each into near-equal runs of about SHARD_ROWS rows."""
+    shards = max(1, round(columns * rows_per_column / SHARD_ROWS))
+    shards = min(shards, columns)
+    edges = [round(index * columns / shards) for index in range(shards + 1)]
+    return list(zip(edges, edges[1:]))
