@@ -127,15 +127,16 @@ class Learner:
             metrics |= result
         return metrics
 
-    def state(self) -> dict[str, Tensor]:
-        """Everything the next update depends on, by name."""
-        tensors = {'value_norm': self._value_norm.state()}
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything the next update depends on, by name; views that change with the next update."""
+        tensors = {'value_norm': self._value_norm.state().numpy()}
         for network, adam in self._networks().items():
-            tensors |= {f'{network}.{name}': tensor for name, tensor in adam.state().items()}
+            tensors |= {f'{network}.{name}': tensor.numpy() for name, tensor in adam.state().items()}
         return tensors
 
-    def load_state(self, tensors: Mapping[str, Tensor]) -> None:
+    def load_state(self, tensors: Mapping[str, np.ndarray]) -> None:
         """Take over what `state` gave; KeyError or RuntimeError if it is another network's."""
+        tensors = {name: torch.from_numpy(tensor) for name, tensor in tensors.items()}
         self._value_norm.load_state(tensors['value_norm'])
         for network, adam in self._networks().items():
             prefix = f'{network}.'

@@ -55,8 +55,8 @@ class Policy:
         if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != expected:
             raise ValueError(f'these tensors are not a policy of {architecture}')
         self.architecture = architecture
-        self._tensors = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in tensors.items()}
-        self._transposed = {name: np.ascontiguousarray(tensor.T) for name, tensor in self._tensors.items() if tensor.ndim == 2}
+        self.tensors = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in tensors.items()}
+        self._transposed = {name: np.ascontiguousarray(tensor.T) for name, tensor in self.tensors.items() if tensor.ndim == 2}
 
     def initial_state(self, num_worlds: int) -> np.ndarray:
         """Recurrent state before an episode: zeros [W, H]."""
@@ -82,21 +82,21 @@ class Policy:
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         y = x @ self._transposed[f'{name}.weight']
-        y += self._tensors[f'{name}.bias']
+        y += self.tensors[f'{name}.bias']
         return y
 
     def _layer_norm(self, name: str, x: np.ndarray) -> np.ndarray:
         centred = x - x.mean(axis=1, keepdims=True)
         variance = np.einsum('ij,ij->i', centred, centred) / np.float32(x.shape[1])
         centred *= (1 / np.sqrt(variance + LAYER_NORM_EPSILON))[:, None]
-        centred *= self._tensors[f'{name}.weight']
-        centred += self._tensors[f'{name}.bias']
+        centred *= self.tensors[f'{name}.weight']
+        centred += self.tensors[f'{name}.bias']
         return centred
 
     def _gru(self, x: np.ndarray, state: np.ndarray) -> np.ndarray:
         H = self.architecture.hidden_size
-        from_input = x @ self._transposed['gru.weight_ih'] + self._tensors['gru.bias_ih']
-        from_state = state @ self._transposed['gru.weight_hh'] + self._tensors['gru.bias_hh']
+        from_input = x @ self._transposed['gru.weight_ih'] + self.tensors['gru.bias_ih']
+        from_state = state @ self._transposed['gru.weight_hh'] + self.tensors['gru.bias_hh']
         gates = _sigmoid(from_input[:, :2 * H] + from_state[:, :2 * H])
         reset, update = gates[:, :H], gates[:, H:]
         candidate = _tanh(from_input[:, 2 * H:] + reset * from_state[:, 2 * H:])

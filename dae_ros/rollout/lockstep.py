@@ -1,0 +1,214 @@
+"""The two ends of lockstep collection, without ROS: the world steps when all actions are in, an agent acts when asked.
+
+Both ends take in data one by one, in any order of arrival, and answer with the data to send. What does not belong is
+refused by raising `Refused` and changes nothing. The nodes wire these objects to topics; `in_process` wires them to each
+other, so a graph run and an in-process run are the same computation.
+"""
+
+from __future__ import annotations
+
+from typing import Union
+
+import numpy as np
+
+from dae_ros.errors import Refused
+from dae_ros.learning.policy import Policy, choose
+from dae_ros.types import Action, JointState, Observation, RolloutRequest, SharedReward, Stamp
+from dae_ros.worlds.base import JointObservation, Worlds
+
+WorldDatum = Union[JointState, SharedReward, Observation]
+
+PROBABILITY_SUM_TOLERANCE = 1e-3  # float32 softmax over any number of actions stays far within this
+
+
+def check_run(run: int, own_run: int) -> None:
+    """Refuses data of another run; `own_run` 0 means none is known yet."""
+    if run == 0 or own_run not in (0, run):
+        raise Refused(Refused.WRONG_RUN, f'run {run:x}, this node belongs to run {own_run:x}')
+
+
+def check_stamp(stamp: Stamp, request: RolloutRequest | None, own_run: int) -> None:
+    """Refuses a stamp that is not of the rollout under way."""
+    check_run(stamp.run, own_run)
+    if request is None:
+        raise Refused(Refused.UNEXPECTED, f'rollout {stamp.rollout}, but none was requested yet')
+    asked, given = (request.rollout, request.attempt), (stamp.rollout, stamp.attempt)
+    if given != asked:
+        raise Refused(Refused.STALE if given < asked else Refused.UNEXPECTED,
+                      f'rollout {given[0]} attempt {given[1]}, under way is rollout {asked[0]} attempt {asked[1]}')
+
+
+def check_action(action: Action, num_agents: int, num_worlds: int, num_actions: int, policy_version: int) -> None:
+    """Refuses an action no honest agent of this team can have sent. Shapes as in `types.Action`."""
+    if action.robot >= num_agents:
+        raise Refused(Refused.WRONG_ROBOT, f'robot {action.robot} of a team of {num_agents}')
+    if action.policy_version != policy_version:
+        raise Refused(Refused.WRONG_VERSION, f'policy version {action.policy_version}, asked for {policy_version}')
+    expected = (num_worlds, num_actions)
+    if action.probabilities.shape != expected or action.actions.shape != (num_worlds,):
+        raise Refused(Refused.WRONG_SHAPE, f'{action.probabilities.shape} probabilities and {action.actions.shape} actions, '
+                                           f'expected {expected} and {expected[:1]}')
+    if not np.isfinite(action.probabilities).all():
+        raise Refused(Refused.NOT_FINITE, 'a probability is not a finite number')
+    if (action.probabilities < 0).any() or (np.abs(action.probabilities.sum(1) - 1) > PROBABILITY_SUM_TOLERANCE).any():
+        raise Refused(Refused.OUT_OF_RANGE, 'probabilities do not sum to 1')
+    if (action.actions >= num_actions).any():
+        raise Refused(Refused.OUT_OF_RANGE, f'action {action.actions.max()} of {num_actions}')
+    if (action.probabilities[np.arange(num_worlds), action.actions] <= 0).any():
+        raise Refused(Refused.OUT_OF_RANGE, 'an action was chosen that has probability 0')
+
+
+class WorldEnd:
+    """Steps a batch of worlds through the rollouts it is asked for.
+
+    `run` binds it to one run from the start; 0 lets it join the run of the first request it hears.
+    """
+
+    def __init__(self, worlds: Worlds, run: int = 0):
+        self._worlds = worlds
+        self.run = run
+        self.request: RolloutRequest | None = None
+        self._step = 0
+        self._actions: dict[int, np.ndarray] = {}
+
+    @property
+    def waiting_for(self) -> list[int]:
+        """Robots whose action for the current step is missing; empty between rollouts."""
+        if self.request is None or self._step == self.request.num_steps:
+            return []
+        return [robot for robot in range(self._worlds.spec.num_agents) if robot not in self._actions]
+
+    def on_request(self, request: RolloutRequest) -> list[WorldDatum]:
+        """Begins a rollout, or begins it anew; the data of its first step."""
+        check_run(request.run, self.run)
+        if self.request is not None:
+            asked, under_way = (request.rollout, request.attempt), (self.request.rollout, self.request.attempt)
+            if asked <= under_way:
+                raise Refused(Refused.DUPLICATE if asked == under_way else Refused.STALE, f'request for rollout {asked[0]}')
+        self.run, self.request, self._step = request.run, request, 0
+        self._actions = {}
+        return self._show(self._worlds.reset(request.seed, request.rollout))
+
+    def on_action(self, action: Action) -> list[WorldDatum]:
+        """Takes in one robot's action; with the last one missing, steps the worlds and gives what that did."""
+        check_stamp(action.stamp, self.request, self.run)
+        if action.stamp.step < self._step or action.robot in self._actions:
+            raise Refused(Refused.DUPLICATE, f'robot {action.robot} already acted at step {action.stamp.step}')
+        if action.stamp.step > self._step or self._step == self.request.num_steps:
+            raise Refused(Refused.UNEXPECTED, f'step {action.stamp.step}, under way is step {self._step}')
+        spec = self._worlds.spec
+        check_action(action, spec.num_agents, self._worlds.num_worlds, spec.num_actions, self.request.policy_version)
+        self._actions[action.robot] = action.actions
+        if len(self._actions) < spec.num_agents:
+            return []
+        joint = np.stack([self._actions[robot] for robot in range(spec.num_agents)], axis=1)
+        transition = self._worlds.step(joint.astype(np.int64))
+        reward = SharedReward(self._stamp(), transition.reward, transition.terminated, transition.truncated,
+                              transition.final_states)
+        self._step += 1
+        self._actions = {}
+        return [reward, *self._show(transition.next)]
+
+    def _stamp(self) -> Stamp:
+        return Stamp(self.run, self.request.rollout, self.request.attempt, self._step)
+
+    def _show(self, seen: JointObservation) -> list[WorldDatum]:
+        """The joint state for the trainer and, while the rollout lasts, each robot's observation.
+
+        The agents come first: they are on the critical path, the trainer is not.
+        """
+        stamp = self._stamp()
+        joint = JointState(stamp, seen.episode_start, seen.observations, seen.state)
+        if self._step == self.request.num_steps:
+            return [joint]
+        observations = [Observation(stamp, robot, self.request.policy_version, seen.episode_start,
+                                    np.ascontiguousarray(seen.observations[:, robot]))
+                        for robot in range(self._worlds.spec.num_agents)]
+        return [*observations, joint]
+
+
+class AgentEnd:
+    """Acts for one robot: only on the rollout asked for, only with the version it names, each step once."""
+
+    def __init__(self, robot: int, run: int = 0):
+        self.robot = robot
+        self.run = run
+        self.request: RolloutRequest | None = None
+        self._policies: dict[int, Policy] = {}
+        self._pending: Observation | None = None  # of the rollout under way, waiting for the policy it names
+        self._early: Observation | None = None    # of a rollout whose request is still on its way
+        self._next_step = 0
+        self._state: np.ndarray | None = None
+
+    @property
+    def newest_version(self) -> int | None:
+        """The newest policy version held."""
+        return max(self._policies, default=None)
+
+    @property
+    def missing_version(self) -> int | None:
+        """The version that the rollout under way names and this agent does not hold."""
+        version = None if self.request is None else self.request.policy_version
+        return version if version not in self._policies else None
+
+    def on_request(self, request: RolloutRequest) -> Action | None:
+        """Takes note of the rollout under way."""
+        check_run(request.run, self.run)
+        if self.request is not None and (request.rollout, request.attempt) <= (self.request.rollout, self.request.attempt):
+            raise Refused(Refused.STALE, f'request for rollout {request.rollout} attempt {request.attempt}')
+        self.run, self.request, self._next_step, self._state, self._pending = request.run, request, 0, None, None
+        early, self._early = self._early, None
+        if early is not None and early.stamp[:3] == (request.run, request.rollout, request.attempt):
+            return self.on_observation(early)
+        return None
+
+    def on_policy(self, version: int, policy: Policy) -> Action | None:
+        """Takes in one version of the policy; the two newest and the one in use are kept."""
+        if version in self._policies:
+            raise Refused(Refused.DUPLICATE, f'policy version {version}')
+        self._policies[version] = policy
+        in_use = None if self.request is None else self.request.policy_version
+        for old in sorted(self._policies)[:-2]:
+            if old != in_use:
+                del self._policies[old]
+        return self._act()
+
+    def on_observation(self, observation: Observation) -> Action | None:
+        """The action that answers the observation, or None while the request or the policy it needs is on its way."""
+        stamp = observation.stamp
+        check_run(stamp.run, self.run)
+        if observation.robot != self.robot:
+            raise Refused(Refused.WRONG_ROBOT, f'observation of robot {observation.robot}, this is robot {self.robot}')
+        if not np.isfinite(observation.values).all():
+            raise Refused(Refused.NOT_FINITE, 'an observation is not a finite number')
+        request = self.request
+        if request is None or (stamp.rollout, stamp.attempt) > (request.rollout, request.attempt):
+            self._early = observation
+            return None
+        check_stamp(stamp, request, self.run)
+        if stamp.step != self._next_step:
+            raise Refused(Refused.DUPLICATE if stamp.step < self._next_step else Refused.UNEXPECTED,
+                          f'step {stamp.step}, expected step {self._next_step}')
+        if observation.policy_version != request.policy_version:
+            raise Refused(Refused.WRONG_VERSION, f'policy version {observation.policy_version}, the rollout asked for '
+                                                 f'{request.policy_version}')
+        if self._state is not None and len(observation.values) != len(self._state):
+            raise Refused(Refused.WRONG_SHAPE, f'{len(observation.values)} worlds, the rollout began with {len(self._state)}')
+        self._pending = observation
+        return self._act()
+
+    def _act(self) -> Action | None:
+        """Answers the pending observation once the policy it names is here."""
+        pending, request = self._pending, self.request
+        if pending is None or pending.policy_version not in self._policies:
+            return None
+        self._pending = None
+        policy = self._policies[pending.policy_version]
+        if pending.values.shape[1] != policy.architecture.observation_size:
+            raise Refused(Refused.WRONG_SHAPE, f'{pending.values.shape[1]} features, the policy takes '
+                                               f'{policy.architecture.observation_size}')
+        state = policy.initial_state(len(pending.values)) if self._state is None else self._state
+        probabilities, self._state = policy.act(pending.values, state, pending.episode_start)
+        actions = choose(probabilities, request.greedy, request.seed, request.rollout, pending.stamp.step, self.robot)
+        self._next_step += 1
+        return Action(pending.stamp, self.robot, pending.policy_version, actions, probabilities)

@@ -1,0 +1,81 @@
+"""The folder a run leaves: settings, metrics, checkpoints, policy, pictures and summary."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Mapping
+
+import numpy as np
+
+from dae_ros import config
+from dae_ros.config import Settings
+from dae_ros.errors import Refused, RunFolderError
+from dae_ros.files import write_atomically
+from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint
+
+
+class RunFolder:
+    """`runs/<name>/`. A folder belongs to one set of settings; opening it again with the same ones resumes the run."""
+
+    def __init__(self, path: Path, settings: Settings):
+        """Makes the folder or opens an earlier one. Raises RunFolderError if it holds another run or cannot be written."""
+        self.path = path
+        self._keep = settings.run.keep_checkpoints
+        text = config.to_yaml(settings)
+        try:
+            self.checkpoints.mkdir(parents=True, exist_ok=True)
+            if self.settings_file.exists():
+                if self.settings_file.read_text(encoding='utf-8') != text:
+                    raise RunFolderError(f'{path} holds a run with other settings; choose another name or delete it')
+            else:
+                write_atomically(self.settings_file, text.encode())
+        except OSError as error:
+            raise RunFolderError(f'cannot write the run folder {path}: {error.strerror}') from error
+
+    @property
+    def settings_file(self) -> Path:
+        return self.path / 'settings.yaml'
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / 'checkpoints'
+
+    @property
+    def policies(self) -> Path:
+        """Versions of the policy, written by the parameter server."""
+        return self.path / 'policies'
+
+    @property
+    def policy_file(self) -> Path:
+        """The trained policy."""
+        return self.path / 'policy.safetensors'
+
+    @property
+    def metrics_file(self) -> Path:
+        return self.path / 'metrics.csv'
+
+    @property
+    def summary_file(self) -> Path:
+        return self.path / 'summary.json'
+
+    def save_checkpoint(self, update: int, tensors: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
+        """Writes the checkpoint after `update` updates and deletes the oldest beyond those kept."""
+        write_atomically(self._checkpoint(update), encode_checkpoint(tensors, facts))
+        for old in self._updates()[:-self._keep]:
+            self._checkpoint(old).unlink(missing_ok=True)
+
+    def newest_checkpoint(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+        """Tensors and facts of the newest whole checkpoint; torn or corrupted ones are passed over."""
+        for update in reversed(self._updates()):
+            try:
+                return decode_checkpoint(self._checkpoint(update).read_bytes())
+            except Refused:
+                continue
+        return None
+
+    def _updates(self) -> list[int]:
+        names = (path.stem.removeprefix('checkpoint_') for path in self.checkpoints.glob('checkpoint_*.safetensors'))
+        return sorted(int(name) for name in names if name.isdecimal())
+
+    def _checkpoint(self, update: int) -> Path:
+        return self.checkpoints / f'checkpoint_{update:08d}.safetensors'

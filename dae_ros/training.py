@@ -1,0 +1,160 @@
+"""One training from its first rollout to its report: asks for rollouts, learns from them, evaluates, keeps the books.
+
+`Training` knows neither ROS nor the simulator. Whoever collects the rollouts, the trainer node or `in_process`, calls
+`request` and `consume` in turn until `finished`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+
+import numpy as np
+
+from dae_ros import config
+from dae_ros.config import Settings
+from dae_ros.files import write_atomically
+from dae_ros.learning.learner import Learner
+from dae_ros.learning.policy import Policy
+from dae_ros.report.metrics import MetricsLog
+from dae_ros.run_folder import RunFolder
+from dae_ros.types import RolloutRequest, Trajectory, WorldSpec
+from dae_ros.weights.codec import encode_policy, tensors_sha256
+
+
+def run_identity(settings: Settings, name: str) -> int:
+    """The number that marks every message of the run called `name`: 63 bits, never 0."""
+    text = f'{name}/{config.digest(settings)}'
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), 'little') >> 1 or 1
+
+
+def episode_returns(trajectory: Trajectory) -> np.ndarray:
+    """Undiscounted returns of the episodes that ended within the rollout, [number of episodes]."""
+    ended = trajectory.terminated | trajectory.truncated
+    running = np.zeros(trajectory.rewards.shape[1])
+    returns = []
+    for reward, over in zip(trajectory.rewards.astype(np.float64), ended):
+        running += reward
+        returns.append(running[over])
+        running[over] = 0
+    return np.concatenate(returns)
+
+
+class Training:
+    """The state of a run between rollouts. Resumes from the folder's newest checkpoint if there is one."""
+
+    def __init__(self, settings: Settings, spec: WorldSpec, folder: RunFolder):
+        self.settings = settings
+        self.spec = spec
+        self.run = run_identity(settings, folder.path.name)
+        self.mean_return = math.nan
+        self.evaluation: np.ndarray = np.empty(0)
+        self._folder = folder
+        self._learner = Learner(spec, settings.learner, settings.reward_network, settings.run.seed)
+        self._steps_per_rollout = settings.task.num_worlds * settings.run.num_steps
+        self._training_rollouts = -(-settings.run.total_steps // self._steps_per_rollout)
+        self._rollout = 0
+        self._attempt = 0
+        self._updates = 0
+        self._seconds_before = 0.0
+        resumed = folder.newest_checkpoint()
+        if resumed is not None:
+            self._resume(*resumed)
+        self._log = MetricsLog(folder.path, None if resumed is None else self.environment_steps)
+        self._began_at: float | None = None
+        self._steps_at_start = self.environment_steps
+        self._rollout_began_at = 0.0
+        self.policy: Policy = self._learner.policy
+
+    @property
+    def policy_version(self) -> int:
+        """Version of `policy`: the number of updates behind it."""
+        return self._updates
+
+    @property
+    def environment_steps(self) -> int:
+        """Environment steps learnt from so far, all worlds together."""
+        return self._updates * self._steps_per_rollout
+
+    @property
+    def total_steps(self) -> int:
+        """Environment steps at which the training ends: whole rollouts."""
+        return self._training_rollouts * self._steps_per_rollout
+
+    @property
+    def evaluating(self) -> bool:
+        """Whether the training is over and the trained team is being evaluated."""
+        return self._updates == self._training_rollouts
+
+    @property
+    def finished(self) -> bool:
+        """Whether no rollout is wanted any more."""
+        return self.evaluating and len(self.evaluation) >= self.settings.run.evaluation_episodes
+
+    @property
+    def seconds(self) -> float:
+        """Time spent since the first request, earlier runs of a resumed training included."""
+        return self._seconds_before + (0.0 if self._began_at is None else time.monotonic() - self._began_at)
+
+    @property
+    def steps_per_second(self) -> float:
+        """Environment steps per second since this process asked for its first rollout."""
+        elapsed = 0.0 if self._began_at is None else time.monotonic() - self._began_at
+        return (self.environment_steps - self._steps_at_start) / elapsed if elapsed else 0.0
+
+    def request(self) -> RolloutRequest:
+        """The rollout wanted now. Asking again without consuming begins it anew: the next attempt."""
+        now = time.monotonic()
+        self._began_at = self._began_at or now
+        self._rollout_began_at = now
+        request = RolloutRequest(self.run, self._rollout, self._attempt, self.policy_version, self.settings.run.seed,
+                                 self.settings.run.num_steps, self.evaluating and self.settings.run.evaluation_greedy)
+        self._attempt += 1
+        return request
+
+    def consume(self, trajectory: Trajectory) -> None:
+        """Learn from the rollout asked for last, or count it towards the evaluation."""
+        returns = episode_returns(trajectory)
+        if self.evaluating:
+            self.evaluation = np.concatenate([self.evaluation, returns])
+        else:
+            self.mean_return = float(returns.mean()) if len(returns) else math.nan
+            self._learn(trajectory)
+        self._rollout += 1
+        self._attempt = 0
+
+    def save(self) -> None:
+        """Writes a checkpoint of the training as it stands."""
+        facts = {'settings': config.digest(self.settings), 'updates': self._updates, 'rollout': self._rollout,
+                 'seconds': self.seconds, 'mean_return': self.mean_return}
+        self._folder.save_checkpoint(self._updates, self._learner.state(), facts)
+        write_atomically(self._folder.policy_file, encode_policy(self.policy))
+
+    def weights_sha256(self) -> str:
+        """SHA-256 of everything learnt: all networks, their optimisers' moments, the value normaliser."""
+        return tensors_sha256(self._learner.state())
+
+    def close(self) -> None:
+        """Ends the learner's threads and closes the metrics."""
+        self._learner.close()
+        self._log.close()
+
+    def _learn(self, trajectory: Trajectory) -> None:
+        began = time.monotonic()
+        metrics = self._learner.update(trajectory, self._rollout)
+        self.policy = self._learner.policy
+        self._updates += 1
+        ended = time.monotonic()
+        self._log.write(self.environment_steps, {
+            'mean_return': self.mean_return, **metrics, 'seconds/collecting': began - self._rollout_began_at,
+            'seconds/learning': ended - began, 'steps_per_second': self.steps_per_second})
+        if self._updates % self.settings.run.checkpoint_interval == 0 or self.evaluating:
+            self.save()
+
+    def _resume(self, tensors, facts) -> None:
+        self._learner.load_state(tensors)
+        self._updates = facts['updates']
+        self._rollout = facts['updates']
+        self._seconds_before = facts['seconds']
+        self.mean_return = facts['mean_return']

@@ -1,0 +1,95 @@
+"""Policies and checkpoints as safetensors files: a schema in the metadata, a checksum, never pickle.
+
+What comes in is trusted for nothing: size, schema, shapes and finiteness are checked before a tensor is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from typing import Any, Mapping
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from dae_ros.errors import Refused
+from dae_ros.learning.policy import Policy, PolicyArchitecture
+
+POLICY_FORMAT = 'dae_ros.policy/1'
+CHECKPOINT_FORMAT = 'dae_ros.checkpoint/1'
+MAX_POLICY_BYTES = 64 * 2**20
+_HEADER_LENGTH = struct.Struct('<Q')
+
+
+def sha256(data: bytes) -> str:
+    """Hexadecimal SHA-256."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def tensors_sha256(tensors: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 over names, types, shapes and bytes of all tensors: equal exactly where all weights are, bit for bit."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = np.ascontiguousarray(tensors[name])
+        digest.update(f'{name} {tensor.dtype.str} {tensor.shape}\n'.encode())
+        digest.update(tensor.tobytes())
+    return digest.hexdigest()
+
+
+def encode_policy(policy: Policy) -> bytes:
+    """The policy as a safetensors file; equal policies give equal bytes."""
+    return _encode(POLICY_FORMAT, policy.tensors, policy.architecture._asdict())
+
+
+def decode_policy(data: bytes) -> Policy:
+    """The policy in a safetensors file. Raises Refused if it is anything else."""
+    if len(data) > MAX_POLICY_BYTES:
+        raise Refused(Refused.OVERSIZED, f'{len(data)} bytes of weights, at most {MAX_POLICY_BYTES} are taken')
+    tensors, schema = _decode(POLICY_FORMAT, data)
+    try:
+        architecture = PolicyArchitecture(**schema)
+        sizes = architecture[:4]
+        if not all(type(size) is int and 0 < size < 2**16 for size in sizes) or architecture.activation not in ('relu', 'tanh'):
+            raise ValueError(f'{architecture}')
+        policy = Policy(architecture, tensors)
+    except (TypeError, ValueError) as error:
+        raise Refused(Refused.WRONG_SHAPE, f'not a policy: {error}') from error
+    for name, tensor in tensors.items():
+        if tensor.dtype != np.float32 or not np.isfinite(tensor).all():
+            raise Refused(Refused.NOT_FINITE, f'{name} is not all finite 32-bit numbers')
+    return policy
+
+
+def encode_checkpoint(tensors: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> bytes:
+    """A checkpoint file: tensors by name, and facts (JSON values) about the run."""
+    return _encode(CHECKPOINT_FORMAT, tensors, {**facts, 'sha256': tensors_sha256(tensors)})
+
+
+def decode_checkpoint(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors and facts of a checkpoint file. Raises Refused if it is torn, corrupted or something else."""
+    tensors, facts = _decode(CHECKPOINT_FORMAT, data)
+    if facts.pop('sha256', None) != tensors_sha256(tensors):
+        raise Refused(Refused.CORRUPT, 'the checksum does not match')
+    return tensors, facts
+
+
+def _encode(file_format: str, tensors: Mapping[str, np.ndarray], schema: Mapping[str, Any]) -> bytes:
+    # One metadata key, because safetensors writes several in no fixed order.
+    metadata = {'dae_ros': json.dumps({'format': file_format, **schema}, sort_keys=True)}
+    return save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}, metadata=metadata)
+
+
+def _decode(file_format: str, data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    try:
+        (length,) = _HEADER_LENGTH.unpack_from(data)
+        header = json.loads(data[_HEADER_LENGTH.size:_HEADER_LENGTH.size + length])
+        schema = json.loads(header['__metadata__']['dae_ros'])
+        found = schema.pop('format')
+        tensors = load(data)
+    except (struct.error, ValueError, KeyError, TypeError, AttributeError, SafetensorError, RecursionError) as error:
+        raise Refused(Refused.CORRUPT, f'not a {file_format} file: {type(error).__name__} {error}') from error
+    if found != file_format:
+        raise Refused(Refused.CORRUPT, f'format {found!r}, expected {file_format!r}')
+    return tensors, schema
