@@ -48,3 +48,17 @@ class Worlds(ABC):
 
     def close(self) -> None:
         """Release what the worlds hold outside Python's memory."""
+
+
+def check_actions(actions: np.ndarray, num_worlds: int, spec: WorldSpec) -> np.ndarray:
+    """`actions` as an array, if they are integers [W, N] in 0 .. A-1. Raises ValueError naming what is wrong."""
+    actions = np.asarray(actions)
+    if actions.shape != (num_worlds, spec.num_agents):
+        raise ValueError(f'actions must have the shape (worlds, robots) = {(num_worlds, spec.num_agents)}, '
+                         f'not {actions.shape}')
+    if not np.issubdtype(actions.dtype, np.integer):
+        raise ValueError(f'actions must be integers, not {actions.dtype}')
+    if actions.min() < 0 or actions.max() >= spec.num_actions:
+        wrong = actions[(actions < 0) | (actions >= spec.num_actions)][0]
+        raise ValueError(f'actions must lie in 0 .. {spec.num_actions - 1}, not {wrong}')
+    return actions
