@@ -1,0 +1,46 @@
+"""Simulated teams: the built-in tasks, and the way to the worlds of a task by its name."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from dae_ros.config import TaskSettings
+from dae_ros.errors import SettingsError
+from dae_ros.types import WorldSpec
+from dae_ros.worlds.base import JointObservation, Transition, Worlds
+from dae_ros.worlds.matrix_game import MatrixGame
+from dae_ros.worlds.pettingzoo import PREFIX, PettingZooWorlds
+from dae_ros.worlds.tasks import Formation, Line, Navigation
+
+__all__ = ['BUILT_IN', 'JointObservation', 'Transition', 'Worlds', 'make_worlds', 'world_spec']
+
+BUILT_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
+    'navigation': Navigation,
+    'formation': Formation,
+    'line': Line,
+    'matrix_game': MatrixGame,
+}
+
+
+def make_worlds(task: TaskSettings) -> Worlds:
+    """The worlds `task` asks for, not yet reset.
+
+    Raises SettingsError for an unknown task or settings that do not fit it, WorldError where a PettingZoo environment
+    cannot be used.
+    """
+    if task.task in BUILT_IN:
+        return BUILT_IN[task.task](task)
+    if task.task.startswith(PREFIX):
+        return PettingZooWorlds(task)
+    raise SettingsError(f'unknown task {task.task!r}; there are {", ".join(BUILT_IN)} and {PREFIX}MODULE')
+
+
+def world_spec(task: TaskSettings) -> WorldSpec:
+    """The sizes of `task`, for whoever does not simulate it; builds one world, whatever num_worlds.
+
+    Raises as `make_worlds`.
+    """
+    worlds = make_worlds(dataclasses.replace(task, num_worlds=1))
+    worlds.close()
+    return worlds.spec

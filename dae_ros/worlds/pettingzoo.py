@@ -1,0 +1,206 @@
+"""Any PettingZoo parallel environment with discrete actions as W worlds in this process."""
+
+from __future__ import annotations
+
+import importlib
+import random
+from collections.abc import Mapping
+from contextlib import contextmanager
+from typing import Any, Iterator
+
+import numpy as np
+
+from dae_ros import draws
+from dae_ros.config import TaskSettings
+from dae_ros.errors import SettingsError, WorldError
+from dae_ros.types import WorldSpec
+from dae_ros.worlds.base import JointObservation, Transition, Worlds, check_actions
+
+PREFIX = 'pettingzoo:'
+
+
+class PettingZooWorlds(Worlds):
+    """W instances of the environment `MODULE.parallel_env`, for the task `pettingzoo:MODULE`.
+
+    - Observations are flattened to float32 and padded with zeros to the longest among the agents.
+    - The state is the environment's `state()`; where there is none, the padded observations one after another.
+    - The team's reward is the mean of the agents' rewards.
+    - An episode is terminated if every agent is, truncated if all have ended and not all of them terminated.
+    - `N` and `max_cycles` are passed on to environments that take them (num_agents, and episode_steps if it is not 0).
+    - Every episode is seeded from (seed, 'reset', rollout, step, world). Python's and NumPy's global generators, which
+      some environments use, are seeded from (seed, 'global', rollout, step) while the environments run, and put back.
+
+    Raises WorldError for what cannot be simulated, SettingsError if num_agents or episode_steps do not fit.
+    """
+
+    def __init__(self, task: TaskSettings):
+        self._name = task.task
+        if task.observe_others:
+            raise SettingsError(f'observe_others belongs to formation and line; set it to false for {self._name}')
+        build = _find_parallel_env(task.task)
+        self.num_worlds = task.num_worlds
+        self._environments: list[Any] = []
+        self._rollout_key: tuple[int, int] | None = None
+        self._steps = 0
+        try:
+            with _private_global_generators(0):
+                self._environments.append(_build(build, task))
+                self.spec = self._inspect(self._environments[0], task)
+                self._environments += [_build(build, task) for _ in range(task.num_worlds - 1)]
+        except BaseException:
+            self.close()
+            raise
+
+    def _inspect(self, environment: Any, task: TaskSettings) -> WorldSpec:
+        """Sizes of `environment`, and how to flatten what its agents observe."""
+        from gymnasium import spaces
+
+        if not hasattr(environment, 'possible_agents'):
+            raise WorldError(f'{self._name} does not list its possible_agents, so its team is not known beforehand')
+        self._agents = list(environment.possible_agents)
+        if len(self._agents) != task.num_agents:
+            raise SettingsError(f'{self._name} has {len(self._agents)} agents; set num_agents to {len(self._agents)}')
+        actions = [environment.action_space(agent) for agent in self._agents]
+        if not all(isinstance(space, spaces.Discrete) for space in actions):
+            raise WorldError(f'{self._name} has actions that are not discrete ({actions[0]}); they must be Discrete')
+        counts = [int(space.n) for space in actions]
+        if len(set(counts)) > 1:
+            raise WorldError(f'the agents of {self._name} have different numbers of actions ({counts}); '
+                             'they must all have the same')
+        self._first_actions = [int(space.start) for space in actions]
+        self._spaces = [environment.observation_space(agent) for agent in self._agents]
+        if any(isinstance(space, spaces.Dict) and 'action_mask' in space.spaces for space in self._spaces):
+            raise WorldError(f'{self._name} masks actions, which is not supported')
+        try:
+            observation_size = max(spaces.utils.flatdim(space) for space in self._spaces)
+        except (NotImplementedError, ValueError) as error:
+            raise WorldError(f'the observations of {self._name} cannot be flattened: {error}') from error
+
+        environment.reset(seed=0)
+        try:
+            state_size = np.asarray(environment.state(), dtype=np.float32).size
+        except (NotImplementedError, AttributeError):
+            state_size = 0
+        self._has_state = state_size > 0
+        return WorldSpec(task.num_agents, counts[0], observation_size,
+                         state_size or task.num_agents * observation_size, state_is_observations=not self._has_state)
+
+    def reset(self, seed: int, rollout: int) -> JointObservation:
+        self._rollout_key = (seed, rollout)
+        self._steps = 0
+        observations, state = self._empty()
+        with self._own_generators():
+            for world in range(self.num_worlds):
+                self._begin_episode(world, observations[world], state[world])
+        return JointObservation(observations, state, np.ones(self.num_worlds, dtype=bool))
+
+    def step(self, actions: np.ndarray) -> Transition:
+        """As `Worlds.step`. Raises ValueError on actions of another shape, type or range, and WorldError before `reset`
+        or when only some agents of an environment leave."""
+        if self._rollout_key is None:
+            raise WorldError('the worlds must be reset before their first step')
+        actions = check_actions(actions, self.num_worlds, self.spec) + np.array(self._first_actions)
+        self._steps += 1
+        observations, state = self._empty()
+        reward = np.empty(self.num_worlds, dtype=np.float32)
+        terminated, truncated = np.zeros((2, self.num_worlds), dtype=bool)
+        final_states = []
+        with self._own_generators():
+            for world, environment in enumerate(self._environments):
+                joint_action = dict(zip(self._agents, actions[world].tolist()))
+                seen, rewards, terminations, truncations, _ = environment.step(joint_action)
+                reward[world] = sum(float(rewards[agent]) for agent in self._agents) / self.spec.num_agents
+                ended = [terminations[agent] or truncations[agent] for agent in self._agents]
+                if any(ended) and not all(ended):
+                    gone = self._agents[ended.index(True)]
+                    raise WorldError(f'{gone} left {self._name} before the others; members leaving is not supported')
+                terminated[world] = all(terminations[agent] for agent in self._agents)
+                truncated[world] = all(ended) and not terminated[world]
+                if not terminated[world]:
+                    self._show(world, seen, observations[world], state[world])
+                if truncated[world]:
+                    final_states.append(state[world].copy())
+                if all(ended):
+                    self._begin_episode(world, observations[world], state[world])
+        return Transition(reward, terminated, truncated,
+                          np.array(final_states, dtype=np.float32).reshape(-1, self.spec.state_size),
+                          JointObservation(observations, state, terminated | truncated))
+
+    def close(self) -> None:
+        for environment in self._environments:
+            environment.close()
+        self._environments = []
+
+    def _empty(self) -> tuple[np.ndarray, np.ndarray]:
+        spec = self.spec
+        return (np.empty((self.num_worlds, spec.num_agents, spec.observation_size), dtype=np.float32),
+                np.empty((self.num_worlds, spec.state_size), dtype=np.float32))
+
+    def _own_generators(self):
+        seed, rollout = self._rollout_key
+        return _private_global_generators(draws.key(seed, 'global', rollout, self._steps))
+
+    def _begin_episode(self, world: int, observations: np.ndarray, state: np.ndarray) -> None:
+        seed, rollout = self._rollout_key
+        environment = self._environments[world]
+        seen, infos = environment.reset(seed=draws.key(seed, 'reset', rollout, self._steps, world) % 2**31)
+        if set(environment.agents) != set(self._agents):
+            raise WorldError(f'{self._name} begins an episode with {len(environment.agents)} of its '
+                             f'{self.spec.num_agents} agents; members leaving is not supported')
+        if any(isinstance(info, Mapping) and 'action_mask' in info for info in infos.values()):
+            raise WorldError(f'{self._name} masks actions, which is not supported')
+        self._show(world, seen, observations, state)
+
+    def _show(self, world: int, seen: Mapping[str, Any], observations: np.ndarray, state: np.ndarray) -> None:
+        """Write what the agents of a world see, and its state, into `observations` [N, O] and `state` [S]."""
+        from gymnasium import spaces
+
+        observations[:] = 0.0
+        for row, agent, space in zip(observations, self._agents, self._spaces):
+            values = seen[agent]
+            flat = np.ravel(values) if isinstance(space, spaces.Box) else spaces.utils.flatten(space, values)
+            row[:flat.size] = flat
+        state[:] = np.ravel(self._environments[world].state()) if self._has_state else np.ravel(observations)
+
+
+def _find_parallel_env(task: str) -> Any:
+    module_name = task.removeprefix(PREFIX)
+    try:
+        module = importlib.import_module(module_name)
+    except (ImportError, ValueError, TypeError) as error:
+        raise WorldError(f'cannot import {module_name!r} ({error}); install its package or correct the name after '
+                         f'{PREFIX}') from error
+    build = getattr(module, 'parallel_env', None)
+    if not callable(build):
+        raise WorldError(f'{module_name} has no parallel_env, so it is not a PettingZoo parallel environment')
+    return build
+
+
+def _build(build: Any, task: TaskSettings) -> Any:
+    """The environment, with those of our settings that it takes: only trying tells, as most hide behind **kwargs."""
+    arguments = {'N': task.num_agents}
+    if task.episode_steps:
+        arguments['max_cycles'] = task.episode_steps
+    while True:
+        try:
+            return build(**arguments)
+        except TypeError as error:
+            refused = next((name for name in arguments if f"unexpected keyword argument '{name}'" in str(error)), None)
+            if refused is None:
+                raise
+            if refused == 'max_cycles':
+                raise SettingsError(f'{task.task} takes no max_cycles; set episode_steps to 0') from error
+            del arguments[refused]
+
+
+@contextmanager
+def _private_global_generators(seed: int) -> Iterator[None]:
+    """Python's and NumPy's global generators seeded for the block, and as they were afterwards."""
+    python_state, numpy_state = random.getstate(), np.random.get_state()
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    try:
+        yield
+    finally:
+        random.setstate(python_state)
+        np.random.set_state(numpy_state)

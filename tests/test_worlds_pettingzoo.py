@@ -1,0 +1,245 @@
+"""PettingZoo environments as worlds: one from mpe2, one from butterfly, and tiny ones with every oddity."""
+
+import random
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from mpe2 import simple_spread_v3
+from pettingzoo import ParallelEnv
+
+from dae_ros import draws
+from dae_ros.config import TaskSettings
+from dae_ros.errors import SettingsError, WorldError
+from dae_ros.worlds import make_worlds, world_spec
+
+
+class TinyTeam(ParallelEnv):
+    """Two agents; both observe noise of the global generators. Subclasses and arguments bend it."""
+
+    metadata = {'name': 'tiny_team'}
+    lengths = (2, 3)                                  # of the observations
+    actions = (spaces.Discrete(3), spaces.Discrete(3))
+    ends = {'terminations': (4, 4), 'truncations': (9, 9)}  # step after which each agent ends
+
+    def __init__(self):
+        self.possible_agents = ['left', 'right']
+        self.taken = []
+
+    def observation_space(self, agent):
+        return spaces.Box(-1.0, 1.0, (self.lengths[self.possible_agents.index(agent)],))
+
+    def action_space(self, agent):
+        return self.actions[self.possible_agents.index(agent)]
+
+    def reset(self, seed=None, options=None):
+        self.agents = self.possible_agents[:]
+        self.steps = 0
+        return self._observe(), {agent: {} for agent in self.agents}
+
+    def _observe(self):
+        return {agent: np.full(length, np.random.random() + random.random(), dtype=np.float32)
+                for agent, length in zip(self.possible_agents, self.lengths)}
+
+    def step(self, actions):
+        self.steps += 1
+        self.taken.append(actions)
+        ended = {name: dict(zip(self.possible_agents, (self.steps >= step for step in steps)))
+                 for name, steps in self.ends.items()}
+        rewards = {'left': 1.0, 'right': 2.0}
+        observations = self._observe()
+        if any(any(ends.values()) for ends in ended.values()):
+            self.agents = []
+        return observations, rewards, ended['terminations'], ended['truncations'], {}
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Makes worlds of a TinyTeam with other class attributes."""
+
+    def make(num_worlds=2, num_agents=2, **attributes):
+        team = type('Team', (TinyTeam,), attributes)
+        module = ModuleType('tiny_team')
+        module.parallel_env = team
+        monkeypatch.setitem(sys.modules, 'tiny_team', module)
+        return make_worlds(TaskSettings(task='pettingzoo:tiny_team', num_agents=num_agents, num_worlds=num_worlds))
+
+    return make
+
+
+def spread(num_worlds=3, num_agents=3, **settings):
+    return make_worlds(TaskSettings(task='pettingzoo:mpe2.simple_spread_v3', num_agents=num_agents,
+                                    num_worlds=num_worlds, **settings))
+
+
+def no_actions(worlds):
+    return np.zeros((worlds.num_worlds, worlds.spec.num_agents), dtype=np.int64)
+
+
+def test_an_environment_of_mpe2_runs_as_it_does_by_itself():
+    worlds = spread(num_agents=4, episode_steps=5)
+    assert worlds.spec == (4, 5, 24, 96, False)
+    environment = simple_spread_v3.parallel_env(N=4, max_cycles=5)
+    joint = worlds.reset(seed=7, rollout=2)
+    seen, _ = environment.reset(seed=draws.key(7, 'reset', 2, 0, 1) % 2**31)
+    assert joint.episode_start.all()
+    for step, actions in enumerate(np.random.default_rng(0).integers(5, size=(12, 3, 4)), start=1):
+        np.testing.assert_array_equal(joint.observations[1], list(seen.values()))
+        np.testing.assert_array_equal(joint.state[1], environment.state())
+        transition = worlds.step(actions)
+        seen, rewards, *_ = environment.step(dict(zip(environment.possible_agents, actions[1])))
+        assert transition.reward[1] == pytest.approx(np.mean(list(rewards.values())))
+        ended = step % 5 == 0
+        assert (transition.truncated == ended).all() and not transition.terminated.any()
+        assert (transition.next.episode_start == ended).all()
+        assert transition.final_states.shape == ((3 if ended else 0), 96)
+        if ended:
+            np.testing.assert_array_equal(transition.final_states[1], environment.state())
+            seen, _ = environment.reset(seed=draws.key(7, 'reset', 2, step, 1) % 2**31)
+        joint = transition.next
+    worlds.close()
+
+
+def test_a_world_of_mpe2_does_not_depend_on_how_many_others_there_are():
+    few, many = spread(num_worlds=1), spread(num_worlds=3)
+    np.testing.assert_array_equal(few.reset(1, 0).state[0], many.reset(1, 0).state[0])
+
+
+def test_the_spec_of_an_environment_is_that_of_its_worlds():
+    assert world_spec(TaskSettings(task='pettingzoo:mpe2.simple_spread_v3')) == spread().spec
+
+
+def test_an_environment_of_butterfly_with_images_plugs_in():
+    worlds = make_worlds(TaskSettings(task='pettingzoo:pettingzoo.butterfly.cooperative_pong_v6', num_agents=2,
+                                      num_worlds=1))
+    joint = worlds.reset(seed=1, rollout=0)
+    assert joint.observations.shape == (1, 2, worlds.spec.observation_size)
+    assert joint.state.shape == (1, worlds.spec.state_size)
+    assert worlds.step(np.array([[1, 2]])).reward > 0.0
+    worlds.close()
+
+
+def test_short_observations_are_padded_and_make_the_state_where_there_is_none(tiny):
+    worlds = tiny()
+    assert worlds.spec == (2, 3, 3, 6, True)
+    joint = worlds.reset(seed=1, rollout=0)
+    assert joint.observations[:, 0, :2].all() and joint.observations[:, 1].all()
+    assert not joint.observations[:, 0, 2].any()
+    np.testing.assert_array_equal(joint.state, joint.observations.reshape(2, 6))
+
+
+def test_observations_that_are_no_vectors_are_flattened(tiny):
+    worlds = tiny(observation_space=lambda self, agent: spaces.Discrete(4),
+                  _observe=lambda self: {'left': 1, 'right': 3})
+    np.testing.assert_array_equal(worlds.reset(1, 0).observations[0], np.eye(4)[[1, 3]])
+
+
+def test_actions_that_do_not_begin_at_zero_are_shifted(tiny):
+    worlds = tiny(num_worlds=1, actions=(spaces.Discrete(3, start=5), spaces.Discrete(3)))
+    worlds.reset(1, 0)
+    worlds.step(np.array([[2, 1]], dtype=np.uint16))
+    assert worlds._environments[0].taken == [{'left': 7, 'right': 1}]
+
+
+def test_the_reward_is_the_mean_and_the_end_for_all_terminates(tiny):
+    worlds = tiny()
+    worlds.reset(1, 0)
+    for step in range(1, 9):
+        transition = worlds.step(no_actions(worlds))
+        assert (transition.reward == 1.5).all()
+        assert (transition.terminated == (step % 4 == 0)).all()
+        assert (transition.next.episode_start == transition.terminated).all()
+        assert not transition.truncated.any() and transition.final_states.shape == (0, 6)
+
+
+def test_an_end_that_terminates_only_some_counts_as_cut_off(tiny):
+    worlds = tiny(ends={'terminations': (4, 9), 'truncations': (4, 4)})
+    worlds.reset(1, 0)
+    for _ in range(4):
+        transition = worlds.step(no_actions(worlds))
+    assert transition.truncated.all() and not transition.terminated.any()
+    assert transition.final_states.shape == (2, 6)
+    assert not np.array_equal(transition.final_states, transition.next.state)
+
+
+def test_global_generators_neither_disturb_the_worlds_nor_are_disturbed(tiny):
+    worlds = tiny()
+
+    def rollout(seed, disturb):
+        states = [worlds.reset(seed, rollout=3).state]
+        for _ in range(6):
+            if disturb:
+                np.random.random(), random.random()
+            states.append(worlds.step(no_actions(worlds)).next.state)
+        return np.array(states)
+
+    np.random.seed(0), random.seed(0)
+    expected = np.random.random(), random.random()
+    np.random.seed(0), random.seed(0)
+    first = rollout(1, disturb=False)
+    assert (np.random.random(), random.random()) == expected
+    np.testing.assert_array_equal(rollout(1, disturb=True), first)
+    assert not np.array_equal(rollout(2, disturb=False), first)
+
+
+@pytest.mark.parametrize('attributes, error, complaint', [
+    ({'num_agents': 3}, SettingsError, 'tiny_team has 2 agents; set num_agents to 2'),
+    ({'actions': (spaces.Box(-1, 1), spaces.Box(-1, 1))}, WorldError, 'actions that are not discrete'),
+    ({'actions': (spaces.Discrete(3), spaces.Discrete(4))}, WorldError, r'different numbers of actions \(\[3, 4\]\)'),
+    ({'observation_space': lambda self, agent: spaces.Dict({'action_mask': spaces.MultiBinary(3)})},
+     WorldError, 'masks actions'),
+    ({'observation_space': lambda self, agent: spaces.Sequence(spaces.Discrete(2))}, WorldError, 'cannot be flattened'),
+])
+def test_an_environment_that_does_not_fit_is_refused_in_one_sentence(tiny, attributes, error, complaint):
+    with pytest.raises(error, match=complaint) as caught:
+        tiny(**attributes)
+    assert '\n' not in str(caught.value)
+
+
+def test_masks_told_in_the_infos_are_refused(tiny):
+    def reset(self, seed=None, options=None):
+        observations, infos = TinyTeam.reset(self, seed, options)
+        return observations, {agent: {'action_mask': [1, 1, 0]} for agent in infos}
+
+    with pytest.raises(WorldError, match='masks actions'):
+        tiny(reset=reset).reset(1, 0)
+
+
+def test_members_that_leave_before_the_others_are_named(tiny):
+    worlds = tiny(ends={'terminations': (9, 2), 'truncations': (9, 9)})
+    worlds.reset(1, 0)
+    worlds.step(no_actions(worlds))
+    with pytest.raises(WorldError, match='right left pettingzoo:tiny_team before the others; members leaving is not'):
+        worlds.step(no_actions(worlds))
+
+
+@pytest.mark.parametrize('name, complaint', [
+    ('no_such_module', "cannot import 'no_such_module'"),
+    ('', "cannot import ''"),
+    ('json', 'json has no parallel_env'),
+])
+def test_a_module_that_is_no_environment_is_refused(name, complaint):
+    with pytest.raises(WorldError, match=complaint):
+        make_worlds(TaskSettings(task=f'pettingzoo:{name}'))
+
+
+def test_an_episode_length_that_the_environment_does_not_take_is_refused(tiny):
+    tiny()
+    with pytest.raises(SettingsError, match='takes no max_cycles; set episode_steps to 0'):
+        make_worlds(TaskSettings(task='pettingzoo:tiny_team', num_agents=2, episode_steps=7))
+
+
+def test_settings_of_other_tasks_are_refused():
+    with pytest.raises(SettingsError, match='observe_others'):
+        spread(observe_others=True)
+
+
+def test_actions_are_checked_and_a_reset_comes_first(tiny):
+    worlds = tiny()
+    with pytest.raises(WorldError, match='reset'):
+        worlds.step(no_actions(worlds))
+    worlds.reset(1, 0)
+    with pytest.raises(ValueError, match=r'0 \.\. 2, not 3'):
+        worlds.step(no_actions(worlds) + 3)
