@@ -107,6 +107,36 @@ class Settings:
     run: RunSettings = field(default_factory=RunSettings)
 
 
+@dataclass(frozen=True)
+class RunBinding:
+    """Which run a node belongs to. Every node but the trainer, which begins the run, has it."""
+
+    run: int = setting(0, 'identity of the run to belong to; 0 joins the first run heard of', minimum=0, maximum=2**63 - 1)
+
+
+@dataclass(frozen=True)
+class AgentSettings:
+    """What is particular to one agent."""
+
+    robot: int = setting(0, 'index of the robot this agent acts for, from 0', minimum=0, maximum=65535)
+
+
+@dataclass(frozen=True)
+class ParameterServerSettings:
+    """What is particular to the parameter server."""
+
+    policies_folder: str = setting('runs/policies', 'folder the policy versions are kept in')
+    keep_policies: int = setting(3, 'newest policy versions kept on disk', minimum=1, maximum=1_000_000)
+
+
+@dataclass(frozen=True)
+class TrainerSettings:
+    """What is particular to the trainer."""
+
+    run_folder: str = setting('', 'folder for settings, metrics, checkpoints and policy; empty takes '
+                                  'runs/<task>_n<robots>_seed<seed>. A folder with a checkpoint of the same run resumes it')
+
+
 NESTED_GROUPS = ('reward_network',)
 
 
@@ -150,16 +180,16 @@ class SettingInfo:
 _ARTICLES = {int: 'an integer', float: 'a number', bool: 'true or false', str: 'a text'}
 
 
-def declared_settings() -> Iterator[SettingInfo]:
-    """Every setting's declaration, in the order of the dataclasses."""
-    for group in dataclasses.fields(Settings):
-        group_class = get_type_hints(Settings)[group.name]
-        kinds = get_type_hints(group_class)
-        for declared in dataclasses.fields(group_class):
-            yield SettingInfo(group.name, declared, kinds[declared.name])
+def declarations(*groups: type) -> Iterator[SettingInfo]:
+    """The declarations in the given dataclasses, in their order."""
+    names = {kind: name for name, kind in get_type_hints(Settings).items()}
+    for group in groups:
+        kinds = get_type_hints(group)
+        for declared in dataclasses.fields(group):
+            yield SettingInfo(names.get(group, ''), declared, kinds[declared.name])
 
 
-SETTINGS: dict[str, SettingInfo] = {info.name: info for info in declared_settings()}
+SETTINGS: dict[str, SettingInfo] = {info.name: info for info in declarations(*get_type_hints(Settings).values())}
 
 
 def unknown_setting(name: str, known: Mapping[str, Any] | tuple[str, ...]) -> SettingsError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any, Mapping
 
@@ -15,11 +16,15 @@ from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint
 
 
 class RunFolder:
-    """`runs/<name>/`. A folder belongs to one set of settings; opening it again with the same ones resumes the run."""
+    """`runs/<name>/`. A folder belongs to one set of settings; opening it again with the same ones resumes the run.
+
+    `run` is the number that marks every message of the run.
+    """
 
     def __init__(self, path: Path, settings: Settings):
         """Makes the folder or opens an earlier one. Raises RunFolderError if it holds another run or cannot be written."""
         self.path = path
+        self.run = _identity(settings, path)
         self._keep = settings.run.keep_checkpoints
         text = config.to_yaml(settings)
         try:
@@ -79,3 +84,9 @@ class RunFolder:
 
     def _checkpoint(self, update: int) -> Path:
         return self.checkpoints / f'checkpoint_{update:08d}.safetensors'
+
+
+def _identity(settings: Settings, path: Path) -> int:
+    """63 bits, never 0, from the settings and the folder's name: the same again when the run is resumed."""
+    text = f'{path.name}/{config.digest(settings)}'
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), 'little') >> 1 or 1

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 
@@ -21,12 +20,6 @@ from dae_ros.report.metrics import MetricsLog
 from dae_ros.run_folder import RunFolder
 from dae_ros.types import RolloutRequest, Trajectory, WorldSpec
 from dae_ros.weights.codec import encode_policy, tensors_sha256
-
-
-def run_identity(settings: Settings, name: str) -> int:
-    """The number that marks every message of the run called `name`: 63 bits, never 0."""
-    text = f'{name}/{config.digest(settings)}'
-    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), 'little') >> 1 or 1
 
 
 def episode_returns(trajectory: Trajectory) -> np.ndarray:
@@ -47,7 +40,7 @@ class Training:
     def __init__(self, settings: Settings, spec: WorldSpec, folder: RunFolder):
         self.settings = settings
         self.spec = spec
-        self.run = run_identity(settings, folder.path.name)
+        self.run = folder.run
         self.mean_return = math.nan
         self.evaluation: np.ndarray = np.empty(0)
         self._folder = folder

@@ -5,9 +5,12 @@ The same settings give the same trajectories, bit for bit, as the ROS graph; tes
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from dae_ros.learning.policy import Policy
 from dae_ros.rollout.assembler import Assembler
 from dae_ros.rollout.lockstep import AgentEnd, WorldEnd
+from dae_ros.training import Training
 from dae_ros.types import JointState, Observation, RolloutRequest, Trajectory
 from dae_ros.worlds.base import Worlds
 
@@ -42,3 +45,11 @@ class InProcessCollector:
                 self._assembler.on_action(action)
                 data += self._world.on_action(action)
         return self._assembler.trajectory()
+
+
+def train(training: Training, worlds: Worlds, on_update: Callable[[], None]) -> None:
+    """Takes `training` to its end; `on_update` is called after every rollout."""
+    collector = InProcessCollector(worlds)
+    while not training.finished:
+        training.consume(collector.collect(training.request(), training.policy))
+        on_update()

@@ -1,0 +1,15 @@
+"""Names of topics and services, all relative: a team lives in the namespace its nodes are started in."""
+
+OBSERVATION = 'robot_{}/observation'
+ACTION = 'robot_{}/action'
+JOINT_STATE = 'joint_state'
+SHARED_REWARD = 'shared_reward'
+ROLLOUT_REQUEST = 'rollout_request'
+POLICY_UPDATE = 'policy_update'
+POLICY = 'policy'
+TRAINING_STATUS = 'training_status'
+GET_POLICY = 'get_policy'
+PAUSE = 'trainer/pause'
+RESUME = 'trainer/resume'
+SAVE = 'trainer/save'
+DIAGNOSTICS = '/diagnostics'

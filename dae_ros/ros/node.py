@@ -1,0 +1,107 @@
+"""What all nodes share: settings as parameters, refusals counted by reason and shown on /diagnostics, a clean end."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from typing import Any, Callable, Iterable
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+from dae_ros.config import SettingInfo
+from dae_ros.errors import DaeRosError, Refused
+from dae_ros.ros import names, params, qos
+
+DIAGNOSTICS_PERIOD = 1.0  # s
+
+
+class TeamNode(Node):
+    """A node of the team's graph.
+
+    Subclasses take what they need from `settings`, call `listen` and `publisher`, and may override `on_matched`, called
+    whenever an endpoint of theirs found or lost a partner, and `diagnose`.
+    """
+
+    def __init__(self, name: str, declared: Iterable[SettingInfo]):
+        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        self.settings: dict[str, Any] = params.declare(self, declared)
+        self.done = False
+        self._refusals: Counter[tuple[str, str]] = Counter()
+        self._diagnostics = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.EVENTS)
+        self.create_timer(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
+
+    def publisher(self, kind: type, topic: str, profile: QoSProfile) -> Publisher:
+        """A publisher whose partners coming and going call `on_matched`."""
+        callbacks = PublisherEventCallbacks(matched=lambda _: self.on_matched())
+        return self.create_publisher(kind, topic, profile, event_callbacks=callbacks)
+
+    def listen(self, kind: type, topic: str, profile: QoSProfile, handle: Callable[[Any], None]) -> Subscription:
+        """A subscription; a message that `handle` refuses is counted and otherwise ignored."""
+        def receive(message) -> None:
+            try:
+                handle(message)
+            except Refused as refusal:
+                self.refuse(topic, refusal)
+
+        callbacks = SubscriptionEventCallbacks(matched=lambda _: self.on_matched())
+        return self.create_subscription(kind, topic, receive, profile, event_callbacks=callbacks)
+
+    def refuse(self, topic: str, refusal: Refused) -> None:
+        """Counts a refused message; the first one for each topic and reason is also logged."""
+        self._refusals[topic, refusal.reason] += 1
+        if self._refusals[topic, refusal.reason] == 1:
+            self.get_logger().warning(f'refused a message on {topic}: {refusal} (further ones are only counted)')
+
+    def on_matched(self) -> None:
+        """An endpoint found or lost a partner."""
+
+    def diagnose(self) -> tuple[str, dict[str, Any]]:
+        """One sentence on what the node is doing, and values worth showing."""
+        return 'running', {}
+
+    def publish_diagnostics(self) -> None:
+        """Publishes the node's state and the counts of refused messages."""
+        message, values = self.diagnose()
+        values |= {f'refused {topic} {reason}': count for (topic, reason), count in sorted(self._refusals.items())}
+        level = DiagnosticStatus.WARN if self._refusals else DiagnosticStatus.OK
+        status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=message,
+                                  values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+        report = DiagnosticArray(status=[status])
+        report.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(report)
+
+    def close(self) -> None:
+        """Releases what the node holds beyond ROS; called once, also after an error."""
+
+
+def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int:
+    """Runs a node until it is done, interrupted or shut down; the exit code.
+
+    0: done or asked to stop. 2: a setting or the surroundings are wrong, told in one sentence. A bug shows its traceback.
+    """
+    rclpy.init(args=args)
+    node = None
+    try:
+        node = make_node()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not node.done:
+            executor.spin_once()
+        return 0
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except DaeRosError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    finally:
+        if node is not None:
+            node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()

@@ -1,0 +1,22 @@
+"""Quality of service of every topic, by name.
+
+Reliable alone does not protect data: a keep-last queue overwrites silently when it is flooded. Lockstep bounds what is
+under way to one rollout, and `ROLLOUT` is deeper than the longest one.
+"""
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+
+def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.RELIABLE,
+                      durability=durability)
+
+
+LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+"""The last value is what counts, also for who comes late: requests, policies, status, pending observations."""
+
+ROLLOUT = _reliable(1024, DurabilityPolicy.VOLATILE)
+"""Every datum of a rollout counts: joint states, rewards, actions."""
+
+EVENTS = _reliable(10, DurabilityPolicy.VOLATILE)
+"""A few messages now and then: diagnostics."""

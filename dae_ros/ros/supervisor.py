@@ -1,0 +1,66 @@
+"""Starts processes, notices when one ends, and leaves none behind."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import threading
+import time
+from pathlib import Path
+from typing import Callable, Mapping
+
+GRACE = 8.0  # s from the request to stop until a process is killed
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None)
+
+
+def _end_with_parent() -> None:
+    """In the child, before it becomes the node: have the kernel end it should the supervisor be killed."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class Supervisor:
+    """A group of processes with a log file each.
+
+    `on_exit(name, code)` is called from another thread when a process ends, whatever the reason.
+    """
+
+    def __init__(self, log_folder: Path, on_exit: Callable[[str, int], None]):
+        self._log_folder = log_folder
+        self._on_exit = on_exit
+        self._processes: dict[str, subprocess.Popen] = {}
+        log_folder.mkdir(parents=True, exist_ok=True)
+
+    def start(self, name: str, command: list[str], environment: Mapping[str, str]) -> None:
+        """Starts a process in a session of its own: Ctrl-C in the terminal reaches the supervisor alone."""
+        with open(self.log_file(name), 'ab') as log:
+            process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                                       start_new_session=True, preexec_fn=_end_with_parent)
+        self._processes[name] = process
+        threading.Thread(target=self._watch, args=(name, process), daemon=True).start()
+
+    def log_file(self, name: str) -> Path:
+        """Where the process's output goes."""
+        return self._log_folder / f'{name}.log'
+
+    def stop(self) -> None:
+        """Asks every process to end and kills what has not within `GRACE` seconds. May be interrupted: then kills at once."""
+        try:
+            self._signal(signal.SIGINT)
+            deadline = time.monotonic() + GRACE
+            for process in self._processes.values():
+                process.wait(max(0.0, deadline - time.monotonic()))
+        except (subprocess.TimeoutExpired, KeyboardInterrupt):
+            self._signal(signal.SIGKILL)
+        for process in self._processes.values():
+            process.wait()
+
+    def _signal(self, number: int) -> None:
+        for process in self._processes.values():
+            if process.poll() is None:
+                os.killpg(process.pid, number)
+
+    def _watch(self, name: str, process: subprocess.Popen) -> None:
+        self._on_exit(name, process.wait())

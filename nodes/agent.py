@@ -1,0 +1,108 @@
+"""agent: acts for one robot with the policy the parameter server hands out.
+
+    ros2 run dae_ros agent --ros-args -p robot:=0 -r __node:=agent_0
+"""
+
+from __future__ import annotations
+
+import sys
+
+from dae_ros_msgs import msg, srv
+
+from dae_ros.config import AgentSettings, RunBinding, declarations
+from dae_ros.errors import Refused
+from dae_ros.rollout.lockstep import AgentEnd, check_run
+from dae_ros.ros import convert, names, qos
+from dae_ros.ros.node import TeamNode, run
+from dae_ros.types import Action
+from dae_ros.weights.codec import decode_policy, sha256
+
+LISTENERS = 2  # the world and the trainer: an action must reach both
+
+
+class AgentNode(TeamNode):
+    """Wires an `AgentEnd` to its topics."""
+
+    def __init__(self):
+        super().__init__('agent', declarations(AgentSettings, RunBinding))
+        robot, binding = self.settings['robot'], self.settings['run']
+        self._end = AgentEnd(robot, binding)
+        self._bound = binding != 0
+        self._unsent: msg.Action | None = None
+        self._fetching: int | None = None
+        self._topic = names.OBSERVATION.format(robot)
+        self._actions = self.publisher(msg.Action, names.ACTION.format(robot), qos.ROLLOUT)
+        self._get_policy = self.create_client(srv.GetPolicy, names.GET_POLICY)
+        self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED, self._on_policy)
+        self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED, self._on_status)
+        self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED, self._on_request)
+        self.listen(msg.Observation, self._topic, qos.LATCHED, self._on_observation)
+
+    def on_matched(self) -> None:
+        if self._unsent is not None and self._actions.get_subscription_count() >= LISTENERS:
+            unsent, self._unsent = self._unsent, None
+            self._actions.publish(unsent)
+
+    def _on_request(self, message: msg.RolloutRequest) -> None:
+        self._act(self._end.on_request(convert.rollout_request(message)))
+        self._fetch_if_passed()
+
+    def _on_observation(self, message: msg.Observation) -> None:
+        self._act(self._end.on_observation(convert.observation(message)))
+
+    def _on_policy(self, message: msg.PolicyWeights) -> None:
+        weights = convert.policy_weights(message)
+        check_run(weights.run, self._end.run)
+        if sha256(weights.data) != weights.sha256:
+            raise Refused(Refused.CORRUPT, f'the checksum of policy version {weights.version} does not match')
+        self._act(self._end.on_policy(weights.version, decode_policy(weights.data)))
+        self._fetch_if_passed()
+
+    def _fetch_if_passed(self) -> None:
+        """Asks the parameter server for the version the rollout names if only newer ones will come by themselves."""
+        wanted, newest = self._end.missing_version, self._end.newest_version
+        if wanted is None or wanted == self._fetching or newest is None or newest < wanted:
+            return
+        self._fetching = wanted
+        self._get_policy.call_async(srv.GetPolicy.Request(version=wanted)).add_done_callback(self._on_fetched)
+
+    def _on_fetched(self, future) -> None:
+        response, self._fetching = future.result(), None
+        try:
+            if not response.success:
+                raise Refused(Refused.WRONG_VERSION, response.message)
+            self._on_policy(response.policy)
+        except Refused as refusal:
+            self.refuse(names.GET_POLICY, refusal)
+
+    def _on_status(self, message: msg.TrainingStatus) -> None:
+        """An agent that joined the run it heard is free for the next one when that run is over."""
+        if message.state == msg.TrainingStatus.FINISHED and message.run == self._end.run and not self._bound:
+            self._end = AgentEnd(self._end.robot)
+
+    def _act(self, action: Action | None) -> None:
+        if action is None:
+            return
+        message = convert.action_message(action)
+        if self._actions.get_subscription_count() >= LISTENERS:
+            self._actions.publish(message)
+        else:
+            self._unsent = message
+
+    def diagnose(self):
+        version = self._end.newest_version
+        if version is None:
+            sentence = 'waiting for a policy'
+        elif self._unsent is not None:
+            sentence = 'waiting for the world and the trainer to listen'
+        else:
+            sentence = 'acting'
+        return sentence, {'run': f'{self._end.run:x}', 'robot': self._end.robot, 'policy version': version}
+
+
+def main(args: list[str] | None = None) -> int:
+    return run(AgentNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,187 @@
+"""bringup: trains a team from one task file: starts the whole graph, shows its progress, and stops it again.
+
+    ros2 run dae_ros bringup navigation -p seed:=2
+    ros2 run dae_ros bringup config/navigation.yaml --in-process
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+from datetime import datetime
+from pathlib import Path
+
+from dae_ros import config
+from dae_ros.config import SETTINGS, Settings
+from dae_ros.errors import DaeRosError, SettingsError
+from dae_ros.report.progress import ProgressDisplay
+from dae_ros.report.summary import Summary
+from dae_ros.run_folder import RunFolder
+from dae_ros.worlds import world_spec
+
+LOG_TAIL = 15  # lines of a dead node's log that are shown
+
+
+def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
+    settings_help = '\n'.join(f'  {info.name} := {info.default!r}  {info.describe()}' for info in SETTINGS.values())
+    parser = argparse.ArgumentParser(prog='bringup', description=__doc__.split('\n')[0].removeprefix('bringup: '),
+                                     epilog=f'settings (in the task file, or with -p):\n{settings_help}',
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('task_file', nargs='?', help='a task file, or the name of one that comes with the package, such as '
+                                                     'navigation; without one every setting has its default')
+    parser.add_argument('-p', '--parameter', action='append', default=[], metavar='NAME:=VALUE', help='change a setting')
+    parser.add_argument('--run-folder', type=Path, help='where the run goes; default runs/<task file>-<time>. A folder with '
+                                                        'an unfinished run of the same settings resumes it')
+    parser.add_argument('--namespace', default='', help='namespace of the team, so that several can run side by side')
+    parser.add_argument('--in-process', action='store_true', help='the same run, bit for bit, in this process without ROS')
+    return parser.parse_args(arguments)
+
+
+def read_settings(arguments: argparse.Namespace) -> Settings:
+    """The task file's settings with those of the command line put in, checked as a whole."""
+    values = config.load_task_file(find_task_file(arguments.task_file)) if arguments.task_file else {}
+    values.update(config.parse_override(text) for text in arguments.parameter)
+    settings = config.from_flat(values)
+    world_spec(settings.task)
+    return settings
+
+
+def find_task_file(name: str) -> Path:
+    """The file `name`, or the one of that name in the package's config folder."""
+    if Path(name).exists() or '/' in name or name.endswith('.yaml'):
+        return Path(name)
+    try:
+        from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+        shipped = Path(get_package_share_directory('dae_ros')) / 'config'
+    except (ImportError, PackageNotFoundError):
+        shipped = Path('config')
+    if not (shipped / f'{name}.yaml').exists():
+        there = ', '.join(sorted(path.stem for path in shipped.glob('*.yaml')))
+        raise SettingsError(f'there is no task file {name!r}; the package has {there}')
+    return shipped / f'{name}.yaml'
+
+
+def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDisplay) -> None:
+    """The run without ROS. Raises KeyboardInterrupt through; what was checkpointed stays."""
+    from dae_ros.report.final import write_report
+    from dae_ros.rollout.in_process import train
+    from dae_ros.training import Training
+    from dae_ros.worlds import make_worlds
+
+    training, worlds = Training(settings, world_spec(settings.task), folder), make_worlds(settings.task)
+    try:
+        train(training, worlds, lambda: display.update(
+            'evaluating' if training.evaluating else 'training', training.environment_steps, training.total_steps,
+            training.mean_return, training.steps_per_second, training.policy_version))
+        display.note('drawing the report')
+        write_report(training, folder)
+    finally:
+        training.close()
+        worlds.close()
+
+
+def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, display: ProgressDisplay) -> None:
+    """The run as separate processes. Raises DaeRosError when a node dies."""
+    import rclpy
+    from dae_ros_msgs.msg import TrainingStatus
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    from dae_ros.ros import names, qos
+    from dae_ros.ros.graph import training_graph
+    from dae_ros.ros.supervisor import Supervisor
+
+    states = {getattr(TrainingStatus, name): name.lower() for name in
+              ('WAITING', 'COLLECTING', 'LEARNING', 'PAUSED', 'EVALUATING', 'FINISHED', 'FAILED')}
+    events: queue.SimpleQueue = queue.SimpleQueue()
+    supervisor = Supervisor(folder.path / 'logs', lambda name, code: events.put((name, code)))
+    environment = node_environment()
+    # The status is watched in the same surroundings that the nodes are given.
+    os.environ.update(environment)
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node('bringup', namespace=namespace, start_parameter_services=False)
+    node.create_subscription(TrainingStatus, names.TRAINING_STATUS, lambda status: events.put(('status', status)), qos.LATCHED)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def spin() -> None:
+        try:
+            executor.spin()
+        except ExternalShutdownException:
+            pass
+
+    spinning = threading.Thread(target=spin, daemon=True)
+    try:
+        for process in training_graph(settings, folder):
+            command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
+                       *process.arguments(folder.settings_file, namespace)]
+            supervisor.start(process.name, command, environment)
+        spinning.start()
+        while True:
+            name, event = events.get()
+            if name == 'status':
+                if event.run == folder.run:
+                    display.update(event.detail or states.get(event.state, '?'), event.environment_steps, event.total_steps,
+                                   event.mean_return, event.steps_per_second, event.policy_version)
+            elif name == 'trainer' and event == 0:
+                return
+            else:
+                tail = supervisor.log_file(name).read_text(errors='replace').splitlines()[-LOG_TAIL:]
+                raise DaeRosError('\n'.join([f'{name} ended with exit code {event}; the end of '
+                                             f'{supervisor.log_file(name)}:', *tail]))
+    finally:
+        supervisor.stop()
+        rclpy.try_shutdown()
+        if spinning.ident is not None:
+            spinning.join()
+
+
+def node_environment() -> dict[str, str]:
+    """This process's environment, with defaults where the user set none: this host only, and quick discovery."""
+    environment = dict(os.environ)
+    environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    try:
+        profile = find_task_file('navigation').with_name('fastdds.xml')
+    except SettingsError:
+        return environment
+    if profile.exists():
+        environment.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(profile.resolve()))
+    return environment
+
+
+def interrupt(number: int, frame) -> None:
+    """SIGTERM ends bringup the way Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
+def main(args: list[str] | None = None) -> int:
+    arguments = parse_arguments(args)
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        settings = read_settings(arguments)
+        stem = Path(arguments.task_file).stem if arguments.task_file else settings.task.task.replace(':', '_')
+        path = arguments.run_folder or Path('runs') / f'{stem}-{datetime.now():%Y%m%d-%H%M%S}'
+        folder = RunFolder(path, settings)
+        with ProgressDisplay() as display:
+            display.note(f'training in {path} (logs of the nodes in {path / "logs"})')
+            if arguments.in_process:
+                train_in_process(settings, folder, display)
+            else:
+                train_on_graph(settings, folder, arguments.namespace, display)
+        print(Summary(**json.loads(folder.summary_file.read_text())).lines())
+        return 0
+    except KeyboardInterrupt:
+        print('stopped; every process is down', file=sys.stderr)
+        return 130
+    except DaeRosError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,95 @@
+"""parameter_server: keeps the policy's versions on disk and hands the newest to the agents.
+
+    ros2 run dae_ros parameter_server --ros-args -p policies_folder:=runs/policies
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from dae_ros_msgs import msg, srv
+
+from dae_ros.config import ParameterServerSettings, RunBinding, declarations
+from dae_ros.errors import Refused, RunFolderError
+from dae_ros.rollout.lockstep import check_run
+from dae_ros.ros import convert, names, qos
+from dae_ros.ros.node import TeamNode, run
+from dae_ros.types import PolicyWeights
+from dae_ros.weights.codec import decode_policy, sha256
+from dae_ros.weights.store import PolicyStore
+
+NEWEST = 2**64 - 1
+
+
+class ParameterServerNode(TeamNode):
+    """Serves a `PolicyStore`; one folder for each run."""
+
+    def __init__(self):
+        super().__init__('parameter_server', declarations(ParameterServerSettings, RunBinding))
+        self._run = self.settings['run']
+        self._bound = self._run != 0
+        self._store: PolicyStore | None = None
+        self._version: int | None = None
+        self._policy = self.publisher(msg.PolicyWeights, names.POLICY, qos.LATCHED)
+        if self._bound:
+            self._open_store()
+        self.listen(msg.PolicyWeights, names.POLICY_UPDATE, qos.LATCHED, self._on_update)
+        self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED, self._on_status)
+        self.create_service(srv.GetPolicy, names.GET_POLICY, self._on_get_policy)
+
+    def _open_store(self) -> None:
+        """Opens the run's folder and serves its newest version."""
+        folder = Path(self.settings['policies_folder']) / f'{self._run:016x}'
+        try:
+            self._store = PolicyStore(folder, self.settings['keep_policies'])
+        except OSError as error:
+            raise RunFolderError(f'cannot write the policies to {folder}: {error.strerror}') from error
+        newest = self._store.newest()
+        if newest is not None:
+            self._publish(PolicyWeights(self._run, newest[0], sha256(newest[1]), newest[1]))
+
+    def _publish(self, weights: PolicyWeights) -> None:
+        self._version = weights.version
+        self._policy.publish(convert.policy_weights_message(weights))
+
+    def _on_update(self, message: msg.PolicyWeights) -> None:
+        weights = convert.policy_weights(message)
+        check_run(weights.run, self._run)
+        if sha256(weights.data) != weights.sha256:
+            raise Refused(Refused.CORRUPT, f'the checksum of policy version {weights.version} does not match')
+        decode_policy(weights.data)
+        if self._store is None:
+            self._run = weights.run
+            self._open_store()
+        if weights.version == self._version:
+            raise Refused(Refused.DUPLICATE, f'policy version {weights.version}')
+        self._store.save(weights.version, weights.data)
+        self._publish(weights)
+
+    def _on_get_policy(self, request: srv.GetPolicy.Request, response: srv.GetPolicy.Response) -> srv.GetPolicy.Response:
+        version = self._version if request.version == NEWEST else request.version
+        data = None if self._store is None or version is None else self._store.load(version)
+        if data is None:
+            response.message = 'there is no policy yet' if self._version is None else f'policy version {version} is not kept'
+            return response
+        response.success = True
+        response.policy = convert.policy_weights_message(PolicyWeights(self._run, version, sha256(data), data))
+        return response
+
+    def _on_status(self, message: msg.TrainingStatus) -> None:
+        """A server that joined the run it heard takes the next one's policies when that run is over."""
+        if message.state == msg.TrainingStatus.FINISHED and message.run == self._run and not self._bound:
+            self._run, self._store, self._version = 0, None, None
+
+    def diagnose(self):
+        sentence = 'waiting for a policy' if self._version is None else f'serving policy version {self._version}'
+        return sentence, {'run': f'{self._run:x}', 'agents': self._policy.get_subscription_count()}
+
+
+def main(args: list[str] | None = None) -> int:
+    return run(ParameterServerNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,189 @@
+"""trainer: learns from the team's joint states, actions and shared reward, and sends out the policy.
+
+    ros2 run dae_ros trainer --ros-args --params-file config/navigation.yaml -p beta:=0.95
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import rclpy
+from dae_ros_msgs import msg
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
+from std_srvs.srv import Trigger
+
+from dae_ros.config import (LearnerSettings, RewardNetworkSettings, RunSettings, TaskSettings, TrainerSettings, declarations,
+                            from_flat)
+from dae_ros.report.final import write_report
+from dae_ros.rollout.assembler import Assembler
+from dae_ros.ros import convert, names, qos
+from dae_ros.ros.node import TeamNode, run
+from dae_ros.run_folder import RunFolder
+from dae_ros.training import Training
+from dae_ros.types import PolicyWeights
+from dae_ros.weights.codec import encode_policy, sha256
+from dae_ros.worlds import world_spec
+
+Status = msg.TrainingStatus
+FAREWELL = Duration(seconds=2)  # to let the last status reach who listens
+
+
+class TrainerNode(TeamNode):
+    """Wires a `Training` and its `Assembler` to their topics. Learning happens in the callback of the last datum."""
+
+    def __init__(self):
+        super().__init__('trainer', declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings,
+                                                 TrainerSettings))
+        folder = self.settings.pop('run_folder')
+        settings = from_flat(self.settings)
+        task = settings.task
+        spec = world_spec(task)
+        folder = Path(folder or f'runs/{task.task.replace(":", "_")}_n{spec.num_agents}_seed{settings.run.seed}')
+        self._folder = RunFolder(folder, settings)
+        self._training = Training(settings, spec, self._folder)
+        self._assembler = Assembler(spec, task.num_worlds)
+        self._state = Status.WAITING
+        self._paused = False
+
+        self._policy_update = self.publisher(msg.PolicyWeights, names.POLICY_UPDATE, qos.LATCHED)
+        self._request = self.publisher(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED)
+        self._status = self.publisher(Status, names.TRAINING_STATUS, qos.LATCHED)
+        self._joint_state = self.listen(msg.JointState, names.JOINT_STATE, qos.ROLLOUT, self._on_joint_state)
+        self._shared_reward = self.listen(msg.SharedReward, names.SHARED_REWARD, qos.ROLLOUT, self._on_reward)
+        self._actions = [self.listen(msg.Action, names.ACTION.format(robot), qos.ROLLOUT, self._on_action)
+                         for robot in range(spec.num_agents)]
+        self.create_service(Trigger, names.PAUSE, self._on_pause)
+        self.create_service(Trigger, names.RESUME, self._on_resume)
+        self.create_service(Trigger, names.SAVE, self._on_save)
+        self._deadline = self.create_timer(settings.run.rollout_timeout, self._on_silence)
+        self._publish_policy()
+        self._advance()
+
+    # The run, from rollout to rollout.
+
+    def on_matched(self) -> None:
+        if self._state == Status.WAITING:
+            self._advance()
+
+    def _advance(self) -> None:
+        """Does what comes next: wait, pause, ask for a rollout, or report and end."""
+        if not self.context.ok():
+            raise ExternalShutdownException()
+        if self._training.finished:
+            self._finish()
+        elif self._paused:
+            self._announce(Status.PAUSED, 'call trainer/resume to go on')
+        elif self._missing():
+            self._announce(Status.WAITING, f'waiting for {", ".join(self._missing())}')
+        else:
+            self._ask()
+
+    def _ask(self) -> None:
+        request = self._training.request()
+        self._assembler.begin(request)
+        self._deadline.reset()
+        self._announce(Status.EVALUATING if self._training.evaluating else Status.COLLECTING, '')
+        self._request.publish(convert.rollout_request_message(request))
+
+    def _missing(self) -> list[str]:
+        """Whom the graph still lacks."""
+        missing = [f'agent of robot {robot}' for robot, action in enumerate(self._actions) if not action.get_publisher_count()]
+        if not self._joint_state.get_publisher_count() or not self._shared_reward.get_publisher_count():
+            missing.append('world')
+        if not self._policy_update.get_subscription_count():
+            missing.append('parameter server')
+        return missing
+
+    def _on_joint_state(self, message: msg.JointState) -> None:
+        self._assembler.on_joint_state(convert.joint_state(message))
+        self._collected()
+
+    def _on_reward(self, message: msg.SharedReward) -> None:
+        self._assembler.on_reward(convert.shared_reward(message))
+        self._collected()
+
+    def _on_action(self, message: msg.Action) -> None:
+        self._assembler.on_action(convert.action(message))
+        self._collected()
+
+    def _collected(self) -> None:
+        """Learns once the rollout is complete."""
+        self._deadline.reset()
+        if not self._assembler.complete:
+            return
+        trajectory = self._assembler.trajectory()
+        if not self._training.evaluating:
+            self._announce(Status.LEARNING, '')
+        version = self._training.policy_version
+        self._training.consume(trajectory)
+        if self._training.policy_version != version:
+            self._publish_policy()
+        self._advance()
+
+    def _on_silence(self) -> None:
+        """Begins a rollout anew when nothing of it has come for too long."""
+        if self._state in (Status.COLLECTING, Status.EVALUATING):
+            self.get_logger().warning(f'nothing heard for {self._training.settings.run.rollout_timeout} s; missing: '
+                                      f'{self._assembler.missing()}; the rollout is begun anew')
+            self._advance()
+
+    def _finish(self) -> None:
+        self._announce(Status.EVALUATING, 'drawing the report')
+        write_report(self._training, self._folder)
+        self._announce(Status.FINISHED, f'the run is in {self._folder.path}')
+        self._status.wait_for_all_acked(FAREWELL)
+        self.done = True
+
+    # What others see.
+
+    def _publish_policy(self) -> None:
+        if not self.context.ok():
+            raise ExternalShutdownException()
+        data = encode_policy(self._training.policy)
+        weights = PolicyWeights(self._training.run, self._training.policy_version, sha256(data), data)
+        self._policy_update.publish(convert.policy_weights_message(weights))
+
+    def _announce(self, state: int, detail: str) -> None:
+        training = self._training
+        self._state = state
+        self._status.publish(Status(run=training.run, state=state, detail=detail,
+                                    environment_steps=training.environment_steps, total_steps=training.total_steps,
+                                    policy_version=training.policy_version, mean_return=training.mean_return,
+                                    steps_per_second=training.steps_per_second))
+
+    def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._paused = True
+        response.success, response.message = True, 'pausing after the rollout under way'
+        return response
+
+    def _on_resume(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = True, 'going on' if self._paused else 'was not paused'
+        self._paused = False
+        if self._state == Status.PAUSED:
+            self._advance()
+        return response
+
+    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._training.save()
+        response.success, response.message = True, f'saved in {self._folder.checkpoints}'
+        return response
+
+    def diagnose(self):
+        training = self._training
+        missing = self._missing()
+        sentence = f'waiting for {", ".join(missing)}' if missing else f'policy version {training.policy_version}'
+        return sentence, {'run': f'{training.run:x}', 'environment steps': training.environment_steps,
+                          'mean return': training.mean_return}
+
+    def close(self) -> None:
+        self._training.close()
+
+
+def main(args: list[str] | None = None) -> int:
+    return run(TrainerNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

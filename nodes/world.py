@@ -1,0 +1,101 @@
+"""world: simulates the team's worlds, in lockstep with its agents.
+
+    ros2 run dae_ros world --ros-args -p task:=navigation -p num_agents:=3 -p num_worlds:=128
+"""
+
+from __future__ import annotations
+
+import sys
+
+from dae_ros_msgs import msg
+
+from dae_ros.config import RunBinding, TaskSettings, declarations, from_flat
+from dae_ros.errors import Refused
+from dae_ros.rollout.lockstep import WorldEnd
+from dae_ros.ros import convert, names, qos
+from dae_ros.ros.node import TeamNode, run
+from dae_ros.types import JointState, Observation, RolloutRequest
+from dae_ros.worlds import make_worlds
+
+
+class WorldNode(TeamNode):
+    """Wires a `WorldEnd` to its topics; begins a rollout once everyone it needs has been found."""
+
+    def __init__(self):
+        super().__init__('world', declarations(TaskSettings, RunBinding))
+        binding = self.settings.pop('run')
+        self._worlds = make_worlds(from_flat(self.settings).task)
+        self._end = WorldEnd(self._worlds, binding)
+        self._bound = binding != 0
+        self._wanted: RolloutRequest | None = None
+        robots = range(self._worlds.spec.num_agents)
+        self._observations = [self.publisher(msg.Observation, names.OBSERVATION.format(i), qos.LATCHED) for i in robots]
+        self._joint_state = self.publisher(msg.JointState, names.JOINT_STATE, qos.ROLLOUT)
+        self._shared_reward = self.publisher(msg.SharedReward, names.SHARED_REWARD, qos.ROLLOUT)
+        self._actions = [self.listen(msg.Action, names.ACTION.format(i), qos.ROLLOUT, self._on_action) for i in robots]
+        self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED, self._on_status)
+        self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED, self._on_request)
+
+    def on_matched(self) -> None:
+        self._begin_if_ready()
+
+    def _on_request(self, message: msg.RolloutRequest) -> None:
+        self._wanted = convert.rollout_request(message)
+        self._begin_if_ready()
+
+    def _begin_if_ready(self) -> None:
+        """Begins the wanted rollout once every message of it would reach someone."""
+        if self._wanted is None or self._missing():
+            return
+        request, self._wanted = self._wanted, None
+        try:
+            self._send(self._end.on_request(request))
+        except Refused as refusal:
+            self.refuse(names.ROLLOUT_REQUEST, refusal)
+
+    def _missing(self) -> list[str]:
+        """Whom the graph still lacks."""
+        missing = [f'agent of robot {robot}' for robot, (observation, action) in enumerate(zip(self._observations, self._actions))
+                   if not observation.get_subscription_count() or not action.get_publisher_count()]
+        if not self._joint_state.get_subscription_count() or not self._shared_reward.get_subscription_count():
+            missing.append('trainer')
+        return missing
+
+    def _on_action(self, message: msg.Action) -> None:
+        self._send(self._end.on_action(convert.action(message)))
+
+    def _on_status(self, message: msg.TrainingStatus) -> None:
+        """A world that joined the run it heard is free for the next one when that run is over."""
+        if message.state == msg.TrainingStatus.FINISHED and message.run == self._end.run and not self._bound:
+            self._end = WorldEnd(self._worlds)
+
+    def _send(self, data) -> None:
+        for datum in data:
+            if isinstance(datum, Observation):
+                self._observations[datum.robot].publish(convert.observation_message(datum))
+            elif isinstance(datum, JointState):
+                self._joint_state.publish(convert.joint_state_message(datum, self._worlds.spec.state_is_observations))
+            else:
+                self._shared_reward.publish(convert.shared_reward_message(datum))
+
+    def diagnose(self):
+        request = self._end.request
+        if self._wanted is not None:
+            sentence = f'waiting for {", ".join(self._missing())}'
+        elif self._end.waiting_for:
+            sentence = f'waiting for actions of robots {self._end.waiting_for}'
+        else:
+            sentence = 'waiting for a request'
+        values = {'run': f'{self._end.run:x}'}
+        return sentence, values if request is None else {**values, 'rollout': request.rollout, 'attempt': request.attempt}
+
+    def close(self) -> None:
+        self._worlds.close()
+
+
+def main(args: list[str] | None = None) -> int:
+    return run(WorldNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
