@@ -15,7 +15,7 @@ from dae_ros.rollout.lockstep import AgentEnd, check_run
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.types import Action
-from dae_ros.weights.codec import decode_policy, sha256
+from dae_ros.weights.codec import open_weights
 
 LISTENERS = 2  # the world and the trainer: an action must reach both
 
@@ -53,9 +53,7 @@ class AgentNode(TeamNode):
     def _on_policy(self, message: msg.PolicyWeights) -> None:
         weights = convert.policy_weights(message)
         check_run(weights.run, self._end.run)
-        if sha256(weights.data) != weights.sha256:
-            raise Refused(Refused.CORRUPT, f'the checksum of policy version {weights.version} does not match')
-        self._act(self._end.on_policy(weights.version, decode_policy(weights.data)))
+        self._act(self._end.on_policy(weights.version, open_weights(weights)))
         self._fetch_if_passed()
 
     def _fetch_if_passed(self) -> None:

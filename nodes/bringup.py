@@ -16,11 +16,11 @@ import threading
 from datetime import datetime
 from pathlib import Path
 
-from dae_ros import config
 from dae_ros.config import SETTINGS, Settings
-from dae_ros.errors import DaeRosError, SettingsError
+from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.report.summary import Summary
+from dae_ros.ros.graph import find_task_file, node_environment, read_settings, training_graph
 from dae_ros.run_folder import RunFolder
 from dae_ros.worlds import world_spec
 
@@ -40,30 +40,6 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--namespace', default='', help='namespace of the team, so that several can run side by side')
     parser.add_argument('--in-process', action='store_true', help='the same run, bit for bit, in this process without ROS')
     return parser.parse_args(arguments)
-
-
-def read_settings(arguments: argparse.Namespace) -> Settings:
-    """The task file's settings with those of the command line put in, checked as a whole."""
-    values = config.load_task_file(find_task_file(arguments.task_file)) if arguments.task_file else {}
-    values.update(config.parse_override(text) for text in arguments.parameter)
-    settings = config.from_flat(values)
-    world_spec(settings.task)
-    return settings
-
-
-def find_task_file(name: str) -> Path:
-    """The file `name`, or the one of that name in the package's config folder."""
-    if Path(name).exists() or '/' in name or name.endswith('.yaml'):
-        return Path(name)
-    try:
-        from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
-        shipped = Path(get_package_share_directory('dae_ros')) / 'config'
-    except (ImportError, PackageNotFoundError):
-        shipped = Path('config')
-    if not (shipped / f'{name}.yaml').exists():
-        there = ', '.join(sorted(path.stem for path in shipped.glob('*.yaml')))
-        raise SettingsError(f'there is no task file {name!r}; the package has {there}')
-    return shipped / f'{name}.yaml'
 
 
 def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDisplay) -> None:
@@ -93,16 +69,13 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
     from rclpy.signals import SignalHandlerOptions
 
     from dae_ros.ros import names, qos
-    from dae_ros.ros.graph import training_graph
     from dae_ros.ros.supervisor import Supervisor
 
     states = {getattr(TrainingStatus, name): name.lower() for name in
               ('WAITING', 'COLLECTING', 'LEARNING', 'PAUSED', 'EVALUATING', 'FINISHED', 'FAILED')}
     events: queue.SimpleQueue = queue.SimpleQueue()
     supervisor = Supervisor(folder.path / 'logs', lambda name, code: events.put((name, code)))
-    environment = node_environment()
-    # The status is watched in the same surroundings that the nodes are given.
-    os.environ.update(environment)
+    os.environ.update(node_environment())  # for this process too: it must hear the status
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node('bringup', namespace=namespace, start_parameter_services=False)
     node.create_subscription(TrainingStatus, names.TRAINING_STATUS, lambda status: events.put(('status', status)), qos.LATCHED)
@@ -120,7 +93,7 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
         for process in training_graph(settings, folder):
             command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
                        *process.arguments(folder.settings_file, namespace)]
-            supervisor.start(process.name, command, environment)
+            supervisor.start(process.name, command, os.environ)
         spinning.start()
         while True:
             name, event = events.get()
@@ -141,19 +114,6 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
             spinning.join()
 
 
-def node_environment() -> dict[str, str]:
-    """This process's environment, with defaults where the user set none: this host only, and quick discovery."""
-    environment = dict(os.environ)
-    environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    try:
-        profile = find_task_file('navigation').with_name('fastdds.xml')
-    except SettingsError:
-        return environment
-    if profile.exists():
-        environment.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(profile.resolve()))
-    return environment
-
-
 def interrupt(number: int, frame) -> None:
     """SIGTERM ends bringup the way Ctrl-C does."""
     raise KeyboardInterrupt
@@ -163,8 +123,9 @@ def main(args: list[str] | None = None) -> int:
     arguments = parse_arguments(args)
     signal.signal(signal.SIGTERM, interrupt)
     try:
-        settings = read_settings(arguments)
-        stem = Path(arguments.task_file).stem if arguments.task_file else settings.task.task.replace(':', '_')
+        task_file = find_task_file(arguments.task_file) if arguments.task_file else None
+        settings = read_settings(task_file, arguments.parameter)
+        stem = task_file.stem if task_file else settings.task.task.replace(':', '_')
         path = arguments.run_folder or Path('runs') / f'{stem}-{datetime.now():%Y%m%d-%H%M%S}'
         folder = RunFolder(path, settings)
         with ProgressDisplay() as display:

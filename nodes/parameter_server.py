@@ -16,7 +16,7 @@ from dae_ros.rollout.lockstep import check_run
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.types import PolicyWeights
-from dae_ros.weights.codec import decode_policy, sha256
+from dae_ros.weights.codec import open_weights, sha256
 from dae_ros.weights.store import PolicyStore
 
 NEWEST = 2**64 - 1
@@ -56,9 +56,7 @@ class ParameterServerNode(TeamNode):
     def _on_update(self, message: msg.PolicyWeights) -> None:
         weights = convert.policy_weights(message)
         check_run(weights.run, self._run)
-        if sha256(weights.data) != weights.sha256:
-            raise Refused(Refused.CORRUPT, f'the checksum of policy version {weights.version} does not match')
-        decode_policy(weights.data)
+        open_weights(weights)
         if self._store is None:
             self._run = weights.run
             self._open_store()

@@ -10,7 +10,6 @@ import sys
 from dae_ros_msgs import msg
 
 from dae_ros.config import RunBinding, TaskSettings, declarations, from_flat
-from dae_ros.errors import Refused
 from dae_ros.rollout.lockstep import WorldEnd
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
@@ -40,7 +39,9 @@ class WorldNode(TeamNode):
         self._begin_if_ready()
 
     def _on_request(self, message: msg.RolloutRequest) -> None:
-        self._wanted = convert.rollout_request(message)
+        request = convert.rollout_request(message)
+        self._end.check_request(request)
+        self._wanted = request
         self._begin_if_ready()
 
     def _begin_if_ready(self) -> None:
@@ -48,10 +49,7 @@ class WorldNode(TeamNode):
         if self._wanted is None or self._missing():
             return
         request, self._wanted = self._wanted, None
-        try:
-            self._send(self._end.on_request(request))
-        except Refused as refusal:
-            self.refuse(names.ROLLOUT_REQUEST, refusal)
+        self._send(self._end.on_request(request))
 
     def _missing(self) -> list[str]:
         """Whom the graph still lacks."""

@@ -78,13 +78,17 @@ class WorldEnd:
             return []
         return [robot for robot in range(self._worlds.spec.num_agents) if robot not in self._actions]
 
-    def on_request(self, request: RolloutRequest) -> list[WorldDatum]:
-        """Begins a rollout, or begins it anew; the data of its first step."""
+    def check_request(self, request: RolloutRequest) -> None:
+        """Refuses a request of another run, or one that a later request has superseded."""
         check_run(request.run, self.run)
         if self.request is not None:
             asked, under_way = (request.rollout, request.attempt), (self.request.rollout, self.request.attempt)
             if asked <= under_way:
                 raise Refused(Refused.DUPLICATE if asked == under_way else Refused.STALE, f'request for rollout {asked[0]}')
+
+    def on_request(self, request: RolloutRequest) -> list[WorldDatum]:
+        """Begins a rollout, or begins it anew; the data of its first step."""
+        self.check_request(request)
         self.run, self.request, self._step = request.run, request, 0
         self._actions = {}
         return self._show(self._worlds.reset(request.seed, request.rollout))

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Iterable, NamedTuple
 
+from dae_ros import config
 from dae_ros.config import Settings
+from dae_ros.errors import SettingsError
 from dae_ros.run_folder import RunFolder
+from dae_ros.worlds import world_spec
 
 
 class NodeProcess(NamedTuple):
@@ -14,7 +18,7 @@ class NodeProcess(NamedTuple):
 
     executable: str
     name: str
-    parameters: dict[str, Any]  # beside those of the run's settings file
+    parameters: dict[str, int | str]  # beside those of the run's settings file
 
     def arguments(self, settings_file: Path, namespace: str) -> list[str]:
         """What follows the executable on its command line."""
@@ -33,6 +37,45 @@ def training_graph(settings: Settings, folder: RunFolder) -> list[NodeProcess]:
     return [
         NodeProcess('world', 'world', run),
         *agents,
-        NodeProcess('parameter_server', 'parameter_server', {'policies_folder': folder.policies, **run}),
-        NodeProcess('trainer', 'trainer', {'run_folder': folder.path}),
+        NodeProcess('parameter_server', 'parameter_server', {'policies_folder': str(folder.policies), **run}),
+        NodeProcess('trainer', 'trainer', {'run_folder': str(folder.path)}),
     ]
+
+
+def find_task_file(name: str) -> Path:
+    """The file `name`, or the task file of that name in the package's config folder. Raises SettingsError."""
+    if '/' in name or name.endswith('.yaml'):
+        return Path(name)
+    shipped = shipped_config()
+    if not (shipped / f'{name}.yaml').exists():
+        there = ', '.join(sorted(path.stem for path in shipped.glob('*.yaml')))
+        raise SettingsError(f'there is no task file {name!r}; the package has {there}')
+    return shipped / f'{name}.yaml'
+
+
+def shipped_config() -> Path:
+    """The config folder of the installed package, or of the source tree."""
+    try:
+        from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+    except ImportError:  # an in-process run needs no ROS
+        return Path(__file__).parents[2] / 'config'
+    try:
+        return Path(get_package_share_directory('dae_ros')) / 'config'
+    except PackageNotFoundError:
+        return Path(__file__).parents[2] / 'config'
+
+
+def read_settings(task_file: Path | None, overrides: Iterable[str]) -> Settings:
+    """The task file's settings with the `name:=value` overrides put in, checked as a whole. Raises SettingsError."""
+    values = config.load_task_file(task_file) if task_file else {}
+    values.update(config.parse_override(text) for text in overrides)
+    settings = config.from_flat(values)
+    world_spec(settings.task)
+    return settings
+
+
+def node_environment() -> dict[str, str]:
+    """Environment variables for the nodes where the user has set none: this host only, and quick discovery."""
+    defaults = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+                'FASTRTPS_DEFAULT_PROFILES_FILE': str((shipped_config() / 'fastdds.xml').resolve())}
+    return {name: os.environ.get(name, value) for name, value in defaults.items()}

@@ -45,6 +45,10 @@ class Supervisor:
         """Where the process's output goes."""
         return self._log_folder / f'{name}.log'
 
+    def wait(self, name: str, timeout: float) -> int:
+        """The exit code of a process that ends by itself; subprocess.TimeoutExpired if it does not within `timeout` s."""
+        return self._processes[name].wait(timeout)
+
     def stop(self) -> None:
         """Asks every process to end and kills what has not within `GRACE` seconds. May be interrupted: then kills at once."""
         try:

@@ -16,6 +16,7 @@ from safetensors.numpy import load, save
 
 from dae_ros.errors import Refused
 from dae_ros.learning.policy import Policy, PolicyArchitecture
+from dae_ros.types import PolicyWeights
 
 POLICY_FORMAT = 'dae_ros.policy/1'
 CHECKPOINT_FORMAT = 'dae_ros.checkpoint/1'
@@ -43,10 +44,17 @@ def encode_policy(policy: Policy) -> bytes:
     return _encode(POLICY_FORMAT, policy.tensors, policy.architecture._asdict())
 
 
+def open_weights(weights: PolicyWeights) -> Policy:
+    """The policy in a message. Raises Refused if it is too large, damaged or something else."""
+    if len(weights.data) > MAX_POLICY_BYTES:
+        raise Refused(Refused.OVERSIZED, f'{len(weights.data)} bytes of weights, at most {MAX_POLICY_BYTES} are taken')
+    if sha256(weights.data) != weights.sha256:
+        raise Refused(Refused.CORRUPT, f'the checksum of policy version {weights.version} does not match')
+    return decode_policy(weights.data)
+
+
 def decode_policy(data: bytes) -> Policy:
     """The policy in a safetensors file. Raises Refused if it is anything else."""
-    if len(data) > MAX_POLICY_BYTES:
-        raise Refused(Refused.OVERSIZED, f'{len(data)} bytes of weights, at most {MAX_POLICY_BYTES} are taken')
     tensors, schema = _decode(POLICY_FORMAT, data)
     try:
         architecture = PolicyArchitecture(**schema)

@@ -1,0 +1,42 @@
+"""Trains a team: the same processes that `bringup` starts, from the same description.
+
+    ros2 launch dae_ros train.launch.py task_file:=navigation namespace:=red parameters:="seed:=2 beta:=1"
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from dae_ros.ros.graph import find_task_file, node_environment, read_settings, training_graph
+from dae_ros.run_folder import RunFolder
+
+
+def start(context) -> list:
+    """The nodes of the run that the launch arguments describe; when one ends, all do."""
+    argument = {name: LaunchConfiguration(name).perform(context) for name in ('task_file', 'namespace', 'run_folder', 'parameters')}
+    task_file = find_task_file(argument['task_file'])
+    settings = read_settings(task_file, argument['parameters'].split())
+    path = argument['run_folder'] or f'runs/{task_file.stem}-{datetime.now():%Y%m%d-%H%M%S}'
+    folder = RunFolder(Path(path).absolute(), settings)
+    environment = [SetEnvironmentVariable(name, value) for name, value in node_environment().items()]
+    return environment + [
+        Node(package='dae_ros', executable=process.executable, name=process.name, namespace=argument['namespace'],
+             parameters=[str(folder.settings_file), {name: value for name, value in process.parameters.items()}],
+             output='screen', on_exit=Shutdown(reason=f'{process.name} has ended'))
+        for process in training_graph(settings, folder)]
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription([
+        DeclareLaunchArgument('task_file', default_value='navigation', description='a task file, or the name of one in config/'),
+        DeclareLaunchArgument('namespace', default_value='', description='namespace of the team'),
+        DeclareLaunchArgument('run_folder', default_value='', description='where the run goes; default runs/<task file>-<time>'),
+        DeclareLaunchArgument('parameters', default_value='', description='settings to change: "seed:=2 beta:=1"'),
+        OpaqueFunction(function=start),
+    ])

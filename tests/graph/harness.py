@@ -1,0 +1,141 @@
+"""Starts real node processes for the tests, in whatever order a test wants."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Callable
+
+import rclpy
+from dae_ros_msgs.msg import TrainingStatus
+from rclpy.executors import SingleThreadedExecutor
+
+from dae_ros import config
+from dae_ros.ros import names, qos
+from dae_ros.ros.graph import training_graph
+from dae_ros.ros.supervisor import Supervisor
+from dae_ros.run_folder import RunFolder
+
+TIMEOUT = 120  # s for anything a test waits for; a run takes a tenth of it
+REPOSITORY = Path(__file__).parents[2]
+
+SMALL = {'task': 'navigation', 'num_agents': 3, 'num_worlds': 8, 'num_steps': 25, 'total_steps': 5 * 8 * 25, 'epochs': 2,
+         'reward_network.epochs': 2, 'reward_network.hidden_size': 16, 'hidden_size': 16, 'evaluation_episodes': 8,
+         'rollout_timeout': 20.0}
+"""Five updates of navigation with three robots."""
+
+
+class Graph:
+    """Node processes of one run, started one by one in the order a test wants."""
+
+    def __init__(self, path: Path, values: dict, namespace: str = ''):
+        settings = config.from_flat(values)
+        self.folder = RunFolder(path, settings)
+        self._namespace = namespace
+        self.processes = {process.name: process for process in training_graph(settings, self.folder)}
+        self._codes: dict[str, int] = {}
+        self._supervisor = Supervisor(path / 'logs', self._codes.__setitem__)
+
+    @property
+    def names(self) -> list[str]:
+        return list(self.processes)
+
+    def start(self, *names: str) -> None:
+        for name in names:
+            process = self.processes[name]
+            command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
+                       *process.arguments(self.folder.settings_file, self._namespace)]
+            self._supervisor.start(name, command, os.environ)
+
+    def wait(self, name: str = 'trainer') -> int:
+        """The exit code of a node that ends by itself."""
+        return self._supervisor.wait(name, TIMEOUT)
+
+    def log(self, name: str) -> str:
+        return self._supervisor.log_file(name).read_text()
+
+    def stop(self) -> None:
+        self._supervisor.stop()
+
+    def summary(self) -> dict:
+        return json.loads(self.folder.summary_file.read_text())
+
+
+def bringup(folder: Path, values: dict, *arguments: str) -> subprocess.Popen:
+    """The bringup command in a process of its own, as a user would type it."""
+    settings = [text for name, value in values.items() for text in ('-p', f'{name}:={json.dumps(value)}')]
+    return subprocess.Popen([sys.executable, '-m', 'dae_ros_nodes.bringup', '--run-folder', str(folder), *settings, *arguments],
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process: subprocess.Popen) -> tuple[int, str, str]:
+    """Exit code, output and errors of a command that ends by itself."""
+    output, errors = process.communicate(timeout=TIMEOUT)
+    return process.returncode, output, errors
+
+
+def in_process_summary(folder: Path, values: dict) -> dict:
+    """Summary of the same run in one process: the oracle."""
+    code, _, errors = finish(bringup(folder, values, '--in-process'))
+    assert code == 0, errors
+    return json.loads((folder / 'summary.json').read_text())
+
+
+def processes_naming(text: str) -> list[str]:
+    """Command lines of the live processes that mention `text`."""
+    lines = []
+    for entry in Path('/proc').iterdir():
+        try:
+            line = (entry / 'cmdline').read_bytes().replace(b'\0', b' ').decode(errors='replace')
+        except (OSError, NotADirectoryError):
+            continue
+        if text in line and int(entry.name) != os.getpid():
+            lines.append(line)
+    return lines
+
+
+class Listener:
+    """A node in the test process that hears what a team publishes."""
+
+    def __init__(self, namespace: str = ''):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node('listener', context=self.context, namespace=namespace)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def __enter__(self) -> Listener:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+    def spin_until(self, condition: Callable[[], bool]) -> None:
+        """Takes messages in until `condition` holds; AssertionError if it never does."""
+        deadline = time.monotonic() + TIMEOUT
+        while not condition():
+            assert time.monotonic() < deadline, 'waited in vain'
+            self.executor.spin_once(timeout_sec=1.0)
+
+    def wait_for_status(self, condition: Callable[[TrainingStatus], bool]) -> TrainingStatus:
+        """The first status that fulfils `condition`."""
+        heard: list[TrainingStatus] = []
+        subscription = self.node.create_subscription(TrainingStatus, names.TRAINING_STATUS, heard.append, qos.LATCHED)
+        self.spin_until(lambda: any(condition(status) for status in heard))
+        self.node.destroy_subscription(subscription)
+        return next(status for status in heard if condition(status))
+
+    def call(self, kind: type, name: str, request):
+        """The response of a service."""
+        client = self.node.create_client(kind, name)
+        assert client.wait_for_service(TIMEOUT), f'no service {name}'
+        future = client.call_async(request)
+        self.spin_until(future.done)
+        self.node.destroy_client(client)
+        return future.result()

@@ -1,0 +1,87 @@
+"""What bringup does when things go wrong: it says so, stops what it started, and exits with a code that tells."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+
+import pytest
+from harness import SMALL, TIMEOUT, Listener, bringup, finish, processes_naming
+
+LONG = {**SMALL, 'total_steps': 10**7}
+
+
+@pytest.fixture
+def long_run(domain, tmp_path):
+    """A run that would take hours, seen to be learning."""
+    process = bringup(tmp_path / 'run', LONG)
+    try:
+        with Listener() as listener:
+            listener.wait_for_status(lambda status: status.policy_version >= 1)
+        yield process
+    finally:
+        process.kill()
+        process.communicate(timeout=TIMEOUT)
+
+
+@pytest.mark.parametrize('node', ['world', 'agent_1', 'parameter_server', 'trainer'])
+def test_a_node_that_dies_ends_the_run_with_its_name_and_no_process_left(node, long_run, tmp_path):
+    pid = pid_of(node, tmp_path)
+    os.kill(pid, signal.SIGKILL)
+    code, _, errors = finish(long_run)
+    assert code == 2
+    assert f'{node} ended with exit code -9' in errors
+    assert 'Traceback' not in errors
+    assert not processes_naming(str(tmp_path))
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_stops_every_process(number, long_run, tmp_path):
+    long_run.send_signal(number)
+    code, output, errors = finish(long_run)
+    assert code == 130
+    assert 'Traceback' not in output + errors
+    assert not processes_naming(str(tmp_path))
+    logs = [path.read_text() for path in (tmp_path / 'run' / 'logs').iterdir()]
+    assert len(logs) == 6 and not any('Traceback' in log for log in logs), logs
+
+
+def test_nodes_end_when_bringup_itself_is_killed(long_run, tmp_path):
+    pids = [pid_of(node, tmp_path) for node in ('world', 'agent_0', 'agent_1', 'agent_2', 'parameter_server', 'trainer')]
+    long_run.kill()
+    long_run.wait(TIMEOUT)
+    for pid in pids:
+        wait_until_gone(pid)
+
+
+@pytest.mark.parametrize('arguments, sentence', [
+    (['-p', 'betta:=1'], "unknown setting 'betta'; did you mean 'beta'?"),
+    (['-p', 'beta:=high'], "beta must be a number, not 'high'"),
+    (['-p', 'beta:=2'], 'beta must lie in 0.0 .. 1.0, not 2.0'),
+    (['-p', 'task:=soccer'], "unknown task 'soccer'"),
+    (['missing.yaml'], 'cannot read the task file missing.yaml'),
+    (['no_such_task'], "there is no task file 'no_such_task'"),
+])
+def test_a_wrong_setting_is_one_sentence_before_anything_starts(arguments, sentence, domain, tmp_path):
+    code, _, errors = finish(bringup(tmp_path / 'run', {}, *arguments))
+    assert code == 2
+    assert sentence in errors and len(errors.strip().splitlines()) == 1
+    assert not (tmp_path / 'run').exists()
+
+
+def pid_of(node: str, tmp_path) -> int:
+    pattern = f'__node:={node} .*{tmp_path}' if node in ('parameter_server', 'trainer') else f'{tmp_path}.*__node:={node} '
+    found = subprocess.run(['pgrep', '-f', pattern], capture_output=True, text=True, check=True)
+    return int(found.stdout.split()[0])
+
+
+def wait_until_gone(pid: int) -> None:
+    """Waits for a process that is not a child of ours."""
+    try:
+        descriptor = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return
+    assert select.select([descriptor], [], [], TIMEOUT)[0], f'process {pid} is still there'
+    os.close(descriptor)

@@ -1,0 +1,60 @@
+"""What a training on the graph promises, shown on real processes."""
+
+from __future__ import annotations
+
+import json
+import random
+
+import pytest
+from harness import SMALL, bringup, finish, in_process_summary, processes_naming
+
+MATRIX_GAME = {**SMALL, 'task': 'matrix_game', 'num_agents': 4, 'num_steps': 4, 'total_steps': 5 * 8 * 4, 'beta': 1.0}
+
+
+@pytest.mark.parametrize('values', [SMALL, MATRIX_GAME], ids=['navigation', 'matrix_game'])
+def test_a_graph_run_ends_with_the_weights_of_the_in_process_run_bit_for_bit(values, domain, tmp_path):
+    code, output, errors = finish(bringup(tmp_path / 'graph', values))
+    assert code == 0, errors
+    on_graph = json.loads((tmp_path / 'graph' / 'summary.json').read_text())
+    oracle = in_process_summary(tmp_path / 'alone', values)
+    assert on_graph['weights_sha256'] == oracle['weights_sha256']
+    assert on_graph['evaluation_return'] == oracle['evaluation_return']
+    assert on_graph['weights_sha256'] in output
+    assert (tmp_path / 'graph' / 'policy.safetensors').read_bytes() == (tmp_path / 'alone' / 'policy.safetensors').read_bytes()
+    assert not processes_naming(str(tmp_path))
+
+
+def test_the_same_seed_ends_with_the_same_weights_and_another_seed_with_others(domain, tmp_path):
+    digests = [in_process_summary(tmp_path / name, {**SMALL, 'seed': seed})['weights_sha256']
+               for name, seed in (('a', 1), ('b', 1), ('c', 2))]
+    assert digests[0] == digests[1] != digests[2]
+
+
+@pytest.mark.parametrize('shuffle', range(3))
+def test_nodes_find_each_other_whatever_the_order_they_are_started_in(shuffle, make_graph, tmp_path):
+    graph = make_graph(tmp_path / 'graph', SMALL)
+    names = graph.names
+    random.Random(shuffle).shuffle(names)
+    graph.start(*names)
+    assert graph.wait() == 0, graph.log('trainer')
+    assert graph.summary()['weights_sha256'] == in_process_summary(tmp_path / 'alone', SMALL)['weights_sha256']
+
+
+def test_two_teams_in_two_namespaces_do_not_disturb_each_other(make_graph, tmp_path):
+    runs = {'red': {**SMALL, 'seed': 1}, 'blue': {**SMALL, 'seed': 2, 'num_agents': 2}}
+    graphs = {name: make_graph(tmp_path / name, values, namespace=name) for name, values in runs.items()}
+    for graph in graphs.values():
+        graph.start(*graph.names)
+    for name, graph in graphs.items():
+        assert graph.wait() == 0, graph.log('trainer')
+        oracle = in_process_summary(tmp_path / f'{name}_alone', runs[name])
+        assert graph.summary()['weights_sha256'] == oracle['weights_sha256']
+        assert 'refused' not in ''.join(graph.log(node) for node in graph.names)
+
+
+def test_a_node_that_knows_no_run_joins_the_first_it_hears_of(make_graph, tmp_path):
+    graph = make_graph(tmp_path / 'graph', SMALL)
+    for process in graph.processes.values():
+        process.parameters.pop('run', None)
+    graph.start(*graph.names)
+    assert graph.wait() == 0, graph.log('trainer')
