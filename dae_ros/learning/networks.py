@@ -14,10 +14,22 @@ from torch.nn import functional
 
 from dae_ros import draws
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
+from dae_ros.learning import kernels
 from dae_ros.learning.gru import gru_sequence
 from dae_ros.types import WorldSpec
 
-_ACTIVATIONS = {'relu': (torch.relu, math.sqrt(2)), 'tanh': (torch.tanh, 5 / 3)}
+_ACTIVATIONS = {'identity': lambda x: x, 'relu': torch.relu, 'tanh': torch.tanh}
+_GAINS = {'relu': math.sqrt(2), 'tanh': 5 / 3}
+
+
+def _layer(x: Tensor, linear: nn.Linear | None = None, activation: str = 'identity', norm: nn.LayerNorm | None = None) -> Tensor:
+    """norm(activation(linear(x))); what is None is left out."""
+    weight, bias = (None, None) if linear is None else (linear.weight, linear.bias)
+    scale, shift = (None, None) if norm is None else (norm.weight, norm.bias)
+    if kernels.usable(*(part for part in (x, weight, bias, scale, shift) if part is not None)):
+        return kernels.layer(x, weight, bias, activation, scale, shift)
+    x = _ACTIVATIONS[activation](x if linear is None else linear(x))
+    return x if norm is None else norm(x)
 
 
 class Gru(nn.Module):
@@ -39,7 +51,7 @@ class RecurrentNetwork(nn.Module):
 
     def __init__(self, input_size: int, output_size: int, hidden_size: int, mlp_layers: int, activation: str):
         super().__init__()
-        self._activation = _ACTIVATIONS[activation][0]
+        self._activation = activation
         self.input_norm = nn.LayerNorm(input_size)
         sizes = [input_size] + [hidden_size] * mlp_layers
         self.mlp = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:]))
@@ -50,11 +62,11 @@ class RecurrentNetwork(nn.Module):
 
     def forward(self, inputs: Tensor, initial: Tensor, episode_start: Tensor) -> tuple[Tensor, Tensor]:
         """inputs [L, R, I], initial [R, H], episode_start [L, R] bool -> outputs [L, R, K], states [L, R, H]."""
-        x = self.input_norm(inputs)
+        x = _layer(inputs, norm=self.input_norm)
         for linear, norm in zip(self.mlp, self.mlp_norm):
-            x = norm(self._activation(linear(x)))
+            x = _layer(x, linear, self._activation, norm)
         states = self.gru(x, initial, episode_start)
-        return self.head(self.gru_norm(states)), states
+        return _layer(_layer(states, norm=self.gru_norm), self.head), states
 
 
 class PerAgentRewardNetwork(nn.Module):
@@ -85,29 +97,29 @@ class PerAgentRewardNetwork(nn.Module):
         blocks = torch.arange(N, device=actions.device) * self.num_actions
         embedded = functional.embedding(actions + blocks, self.action_embedding)
         others = torch.relu(embedded.sum(2, keepdim=True) - embedded + self.action_bias)
-        seen = self.state_norm(torch.relu(self.state(state)))
-        joint = self.joint_norm(torch.relu(self.joint_action(others) + self.joint_state(seen).unsqueeze(2)))
+        seen = _layer(state, self.state, 'relu', self.state_norm)
+        joint = _layer(_layer(others, self.joint_action) + self.joint_state(seen).unsqueeze(2), None, 'relu', self.joint_norm)
         states = self.gru(joint.view(L, C * N, -1), initial, episode_start.repeat_interleave(N, dim=1))
-        return self.head(self.gru_norm(states)).view(L, C, N, -1), states
+        return _layer(_layer(states, norm=self.gru_norm), self.head).view(L, C, N, -1), states
 
 
 def make_actor(spec: WorldSpec, settings: LearnerSettings, seed: int) -> RecurrentNetwork:
     """The policy network shared by all agents (algorithm 1, line 11)."""
     actor = RecurrentNetwork(spec.observation_size, spec.num_actions, settings.hidden_size, settings.mlp_layers,
                              settings.activation)
-    return _initialise(actor, _ACTIVATIONS[settings.activation][1], 0.01, seed, 'actor')
+    return _initialise(actor, _GAINS[settings.activation], 0.01, seed, 'actor')
 
 
 def make_critic(spec: WorldSpec, settings: LearnerSettings, seed: int) -> RecurrentNetwork:
     """The central value network on the global state (algorithm 1, line 13)."""
     critic = RecurrentNetwork(spec.state_size, 1, settings.hidden_size, settings.mlp_layers, settings.activation)
-    return _initialise(critic, _ACTIVATIONS[settings.activation][1], 1.0, seed, 'critic')
+    return _initialise(critic, _GAINS[settings.activation], 1.0, seed, 'critic')
 
 
 def make_reward_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int, member: int) -> PerAgentRewardNetwork:
     """Member `member` of the reward ensemble (algorithm 1, line 14)."""
     network = PerAgentRewardNetwork(spec, settings.hidden_size)
-    return _initialise(network, _ACTIVATIONS['relu'][1], 1.0, seed, f'reward_network.{member}')
+    return _initialise(network, _GAINS['relu'], 1.0, seed, f'reward_network.{member}')
 
 
 def _initialise(network: nn.Module, hidden_gain: float, head_gain: float, seed: int, name: str):

@@ -1,0 +1,665 @@
+/* The learner's layers on one core: GRU over a sequence and [linear, activation, LayerNorm], forward and backward.
+ *
+ * Plain C with the vector extensions of GCC and clang. All matrices are row-major float32 and may lie at any address.
+ * A result's bits depend on the numbers that went in alone: every sum runs in one fixed order, whatever the alignment,
+ * the row's place in a block or the thread.
+ *
+ * Products run on register tiles of ROWS x COLUMNS. Their right operand is packed once per call into panels of COLUMNS
+ * columns, zero-padded; a panel's block of DEPTH rows stays in the first-level cache while the rows pass by it.
+ */
+
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+#if defined(__SSE__)
+#include <xmmintrin.h>
+#endif
+
+enum { LANES = 8, ROWS = 6, COLUMNS = 2 * LANES, DEPTH = 256, BLOCK = 96 };
+enum { IDENTITY = 0, RELU = 1, TANH = 2 };
+
+typedef float vec __attribute__((vector_size(LANES * 4)));
+typedef int32_t ivec __attribute__((vector_size(LANES * 4)));
+typedef float unaligned_vec __attribute__((vector_size(LANES * 4), aligned(4), may_alias));
+
+#define INLINE static inline __attribute__((always_inline))
+
+INLINE vec load(const float *p) { return *(const unaligned_vec *)p; }
+
+INLINE void store(float *p, vec v) { *(unaligned_vec *)p = v; }
+
+INLINE vec all(float x) { return (vec){x, x, x, x, x, x, x, x}; }
+
+/* The first n floats at p, then zeros; n may exceed LANES. */
+INLINE vec load_upto(const float *p, long n) {
+    if (n >= LANES)
+        return load(p);
+    vec v = all(0);
+    for (long i = 0; i < n; i++)
+        v[i] = p[i];
+    return v;
+}
+
+INLINE void store_upto(float *p, vec v, long n) {
+    if (n >= LANES)
+        store(p, v);
+    else
+        for (long i = 0; i < n; i++)
+            p[i] = v[i];
+}
+
+INLINE float sum_of(vec v) { return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7])); }
+
+INLINE vec choose(ivec condition, vec yes, vec no) {
+    return (vec)((condition & (ivec)yes) | (~condition & (ivec)no));
+}
+
+/* e^y - 1 to full relative precision for |y| < 87: 2^k (e^f - 1) + (2^k - 1), the Taylor series on |f| <= ln(2) / 2. */
+INLINE vec expm1_of(vec y) {
+    const vec round_to_integer = all(12582912.0f); /* 1.5 * 2^23: adding it leaves the integer in the low bits */
+    vec shifted = y * all(1.44269504f) + round_to_integer;
+    vec k = shifted - round_to_integer;
+    vec f = y - k * all(0.693359375f) + k * all(2.12194440e-4f);
+    vec series = all(1.0f / 5040);
+    series = series * f + all(1.0f / 720);
+    series = series * f + all(1.0f / 120);
+    series = series * f + all(1.0f / 24);
+    series = series * f + all(1.0f / 6);
+    series = series * f + all(0.5f);
+    series = series * (f * f) + f;
+    vec scale = (vec)(((ivec)shifted << 23) + 0x3f800000); /* the shift drops the constant's own bits */
+    return scale * series + (scale - all(1));
+}
+
+/* Comparisons keep a NaN. */
+INLINE vec clamp(vec x, float limit) {
+    x = choose(x > all(limit), all(limit), x);
+    return choose(x < all(-limit), all(-limit), x);
+}
+
+INLINE vec sigmoid_of(vec x) { return all(1) / (all(2) + expm1_of(clamp(-x, 87))); }
+
+INLINE vec tanh_of(vec x) {
+    vec e = expm1_of(clamp(x + x, 40));
+    return e / (e + all(2));
+}
+
+/* Numbers below 1e-38 count as zero during a call: on some processors they cost a hundred times more. */
+static unsigned long begin_flush(void) {
+#if defined(__SSE__)
+    unsigned mode = _mm_getcsr();
+    _mm_setcsr(mode | 0x8040);
+    return mode;
+#elif defined(__aarch64__)
+    unsigned long mode;
+    __asm__ volatile("mrs %0, fpcr" : "=r"(mode));
+    __asm__ volatile("msr fpcr, %0" ::"r"(mode | (1UL << 24)));
+    return mode;
+#else
+    return 0;
+#endif
+}
+
+static void end_flush(unsigned long mode) {
+#if defined(__SSE__)
+    _mm_setcsr((unsigned)mode);
+#elif defined(__aarch64__)
+    __asm__ volatile("msr fpcr, %0" ::"r"(mode));
+#else
+    (void)mode;
+#endif
+}
+
+static long min(long a, long b) { return a < b ? a : b; }
+
+static long round_up(long n, long multiple) { return (n + multiple - 1) / multiple * multiple; }
+
+/* One allocation per call, handed out piece by piece; `measure` first adds up what the pieces need. */
+typedef struct {
+    char *base;
+    size_t used;
+} Arena;
+
+static float *take(Arena *arena, long floats) {
+    float *piece = arena->base ? (float *)(arena->base + arena->used) : NULL;
+    arena->used += (size_t)round_up(floats * 4, 64);
+    return piece;
+}
+
+static int begin_arena(Arena *arena) {
+    arena->base = aligned_alloc(64, arena->used ? arena->used : 64);
+    arena->used = 0;
+    return arena->base != NULL;
+}
+
+/* Products. */
+
+/* c[rows, COLUMNS] = (or +=) sum over k of a[row, k] * b[k, :], with a at a[row * row_step + k * k_step]. */
+INLINE void tile(const int rows, long K, const float *a, long row_step, long k_step, const float *b, float *c, long ldc,
+                 int accumulate) {
+    vec sum[ROWS][2];
+    for (int r = 0; r < rows; r++)
+        for (int half = 0; half < 2; half++)
+            sum[r][half] = all(0);
+#pragma GCC unroll 4
+    for (long k = 0; k < K; k++) {
+        vec left = *(const vec *)b, right = *(const vec *)(b + LANES);
+        for (int r = 0; r < rows; r++) {
+            vec x = all(a[r * row_step]);
+            sum[r][0] += x * left;
+            sum[r][1] += x * right;
+        }
+        a += k_step;
+        b += COLUMNS;
+    }
+    for (int r = 0; r < rows; r++)
+        for (int half = 0; half < 2; half++)
+            store(c + r * ldc + half * LANES, accumulate ? load(c + r * ldc + half * LANES) + sum[r][half] : sum[r][half]);
+}
+
+#define FOR_EACH_ROW_COUNT(rows, call)                                                                                 \
+    switch (rows) {                                                                                                    \
+    case 6: call(6); break;                                                                                            \
+    case 5: call(5); break;                                                                                            \
+    case 4: call(4); break;                                                                                            \
+    case 3: call(3); break;                                                                                            \
+    case 2: call(2); break;                                                                                            \
+    case 1: call(1); break;                                                                                            \
+    }
+
+static void row_major_tile(long rows, long K, const float *a, long lda, const float *b, float *c, long ldc,
+                           int accumulate) {
+#define CALL(n) tile(n, K, a, lda, 1, b, c, ldc, accumulate)
+    FOR_EACH_ROW_COUNT(rows, CALL)
+#undef CALL
+}
+
+static void packed_tile(long rows, long K, const float *a, const float *b, float *c, long ldc) {
+#define CALL(n) tile(n, K, a, 1, ROWS, b, c, ldc, 1)
+    FOR_EACH_ROW_COUNT(rows, CALL)
+#undef CALL
+}
+
+/* c[M, COLUMNS] = (or +=) a[M, K] panel[K, COLUMNS]. */
+static void times_panel(long M, long K, const float *a, long lda, const float *panel, float *c, long ldc, int accumulate) {
+    for (long k = 0; k < K; k += DEPTH)
+        for (long row = 0; row < M; row += ROWS)
+            row_major_tile(min(ROWS, M - row), min(DEPTH, K - k), a + row * lda + k, lda, panel + k * COLUMNS,
+                           c + row * ldc, ldc, accumulate || k);
+    if (K == 0 && !accumulate)
+        for (long row = 0; row < M; row++)
+            memset(c + row * ldc, 0, COLUMNS * sizeof(float));
+}
+
+static void copy_rows(long rows, long columns, const float *from, long from_step, float *to, long to_step) {
+    for (long row = 0; row < rows; row++)
+        memcpy(to + row * to_step, from + row * from_step, (size_t)columns * sizeof(float));
+}
+
+/* c[M, N] = (or +=) a[M, K] b[K, N], b packed; M <= BLOCK. */
+static void times_packed(long M, long N, long K, const float *a, long lda, const float *b, float *c, long ldc,
+                         int accumulate) {
+    float edge[BLOCK * COLUMNS];
+    for (long column = 0; column < N; column += COLUMNS, b += K * COLUMNS) {
+        long columns = min(COLUMNS, N - column);
+        if (columns == COLUMNS) {
+            times_panel(M, K, a, lda, b, c + column, ldc, accumulate);
+        } else {
+            if (accumulate)
+                copy_rows(M, columns, c + column, ldc, edge, COLUMNS);
+            times_panel(M, K, a, lda, b, edge, COLUMNS, accumulate);
+            copy_rows(M, columns, edge, COLUMNS, c + column, ldc);
+        }
+    }
+}
+
+static long packed_size(long K, long N) { return K * round_up(N, COLUMNS); }
+
+/* Panels of matrix[K, N]; a panel has room for `capacity` rows. */
+static void pack(long K, long N, const float *matrix, long ld, float *panels, long capacity) {
+    for (long column = 0; column < N; column += COLUMNS, panels += capacity * COLUMNS) {
+        const float *from = matrix + column;
+        long columns = N - column;
+        for (long k = 0; k < K; k++, from += ld)
+            for (long half = 0; half < COLUMNS; half += LANES)
+                *(vec *)(panels + k * COLUMNS + half) = columns > half ? load_upto(from + half, columns - half) : all(0);
+    }
+}
+
+/* One panel of the transpose of matrix[columns, K], columns <= COLUMNS. */
+static void pack_transposed_panel(long K, long columns, const float *matrix, long ld, float *panel) {
+    for (long k = 0; k < K; k++)
+        for (long column = 0; column < COLUMNS; column++)
+            panel[k * COLUMNS + column] = column < columns ? matrix[column * ld + k] : 0;
+}
+
+static void pack_transposed(long K, long N, const float *matrix, float *panels) {
+    for (long column = 0; column < N; column += COLUMNS)
+        pack_transposed_panel(K, min(COLUMNS, N - column), matrix + column * K, K, panels + column * K);
+}
+
+/* Sums of outer products, collected until DEPTH rows are there: gradient[M, N] += left[rows, M]^T right[rows, N]. */
+
+/* Panels of ROWS columns of matrix[K, M]; each panel has room for DEPTH rows and a vector's overhang. */
+enum { LEFT_PANEL = DEPTH * ROWS + LANES };
+
+static long left_size(long M) { return round_up(M, ROWS) / ROWS * LEFT_PANEL; }
+
+static void pack_left(long K, long M, const float *matrix, long ld, float *panels) {
+    for (long column = 0; column < M; column += ROWS, panels += LEFT_PANEL) {
+        const float *from = matrix + column;
+        if (M - column >= LANES) /* whole vectors: each overwrites what the one before had too much */
+            for (long k = 0; k < K; k++)
+                store(panels + k * ROWS, load(from + k * ld));
+        else
+            for (long k = 0; k < K; k++)
+                for (long i = 0; i < ROWS; i++)
+                    panels[k * ROWS + i] = column + i < M ? from[k * ld + i] : 0;
+    }
+}
+
+static void add_outer(long M, long N, long K, const float *left, const float *right, float *gradient) {
+    float edge[ROWS * COLUMNS];
+    for (long column = 0; column < N; column += COLUMNS, right += DEPTH * COLUMNS) {
+        long columns = min(COLUMNS, N - column);
+        const float *a = left;
+        for (long row = 0; row < M; row += ROWS, a += LEFT_PANEL) {
+            long rows = min(ROWS, M - row);
+            float *c = gradient + row * N + column;
+            if (columns == COLUMNS) {
+                packed_tile(rows, K, a, right, c, N);
+            } else {
+                copy_rows(rows, columns, c, N, edge, COLUMNS);
+                packed_tile(rows, K, a, right, edge, COLUMNS);
+                copy_rows(rows, columns, edge, COLUMNS, c, N);
+            }
+        }
+    }
+}
+
+/* GRU. */
+
+/* The state before a step: that after the step before, or zero where an episode starts. */
+static void state_before(long rows, long H, const float *states, const uint8_t *start, float *before) {
+    for (long row = 0; row < rows; row++)
+        if (start[row])
+            memset(before + row * H, 0, (size_t)H * sizeof(float));
+        else
+            memcpy(before + row * H, states + row * H, (size_t)H * sizeof(float));
+}
+
+typedef struct {
+    float *weights;  /* per panel of H and gate: input part [I, COLUMNS], state part [H, COLUMNS] */
+    float *before;   /* [BLOCK, H] */
+    float *products; /* reset, update, candidate from the input, candidate from the state: [4, BLOCK, COLUMNS] */
+} GruForward;
+
+static GruForward gru_forward_scratch(Arena *arena, long I, long H) {
+    GruForward s;
+    s.weights = take(arena, 3 * (packed_size(I, H) + packed_size(H, H)));
+    s.before = take(arena, BLOCK * H);
+    s.products = take(arena, 4 * BLOCK * COLUMNS);
+    return s;
+}
+
+/* States [L, R, H] after each step; gates, unless NULL: [L, R, 4 H] candidate, reset, update, candidate from the state.
+ * inputs [L, R, I], initial [R, H], start [L, R], weight_ih [3 H, I], weight_hh [3 H, H], bias_ih, bias_hh [3 H] in the
+ * order reset, update, candidate. Returns 0, or 1 if there is no memory. */
+int gru_forward(long L, long R, long I, long H, const float *inputs, const float *initial, const uint8_t *start,
+                const float *weight_ih, const float *weight_hh, const float *bias_ih, const float *bias_hh, float *states,
+                float *gates) {
+    Arena arena = {0};
+    gru_forward_scratch(&arena, I, H);
+    if (!begin_arena(&arena))
+        return 1;
+    GruForward s = gru_forward_scratch(&arena, I, H);
+    unsigned long mode = begin_flush();
+    const long panel = (I + H) * COLUMNS;
+    for (long column = 0, p = 0; column < H; column += COLUMNS)
+        for (long gate = 0; gate < 3; gate++, p++) {
+            long columns = min(COLUMNS, H - column), first = gate * H + column;
+            pack_transposed_panel(I, columns, weight_ih + first * I, I, s.weights + p * panel);
+            pack_transposed_panel(H, columns, weight_hh + first * H, H, s.weights + p * panel + I * COLUMNS);
+        }
+    for (long first = 0; first < R; first += BLOCK) {
+        const long rows = min(BLOCK, R - first);
+        for (long t = 0; t < L; t++) {
+            const long at = t * R + first;
+            const float *x = inputs + at * I;
+            state_before(rows, H, t ? states + (at - R) * H : initial + first * H, start + at, s.before);
+            const float *weights = s.weights;
+            for (long column = 0; column < H; column += COLUMNS) {
+                for (long gate = 0; gate < 3; gate++, weights += panel) {
+                    float *from_input = s.products + gate * BLOCK * COLUMNS;
+                    float *from_state = gate < 2 ? from_input : from_input + BLOCK * COLUMNS;
+                    times_panel(rows, I, x, I, weights, from_input, COLUMNS, 0);
+                    times_panel(rows, H, s.before, H, weights + I * COLUMNS, from_state, COLUMNS, gate < 2);
+                }
+                for (long half = 0; half < COLUMNS && column + half < H; half += LANES) {
+                    const long j = column + half, lanes = H - j;
+                    const vec reset_bias = load_upto(bias_ih + j, lanes) + load_upto(bias_hh + j, lanes);
+                    const vec update_bias = load_upto(bias_ih + H + j, lanes) + load_upto(bias_hh + H + j, lanes);
+                    const vec input_bias = load_upto(bias_ih + 2 * H + j, lanes);
+                    const vec state_bias = load_upto(bias_hh + 2 * H + j, lanes);
+                    const float *product = s.products + half;
+                    for (long row = 0; row < rows; row++, product += COLUMNS) {
+                        vec reset = sigmoid_of(load(product) + reset_bias);
+                        vec update = sigmoid_of(load(product + BLOCK * COLUMNS) + update_bias);
+                        vec from_state = load(product + 3 * BLOCK * COLUMNS) + state_bias;
+                        vec candidate = tanh_of(load(product + 2 * BLOCK * COLUMNS) + input_bias + reset * from_state);
+                        vec before = load_upto(s.before + row * H + j, lanes);
+                        store_upto(states + (at + row) * H + j, candidate + update * (before - candidate), lanes);
+                        if (gates) {
+                            float *saved = gates + (at + row) * 4 * H + j;
+                            store_upto(saved, candidate, lanes);
+                            store_upto(saved + H, reset, lanes);
+                            store_upto(saved + 2 * H, update, lanes);
+                            store_upto(saved + 3 * H, from_state, lanes);
+                        }
+                    }
+                }
+            }
+        }
+    }
+    end_flush(mode);
+    free(arena.base);
+    return 0;
+}
+
+typedef struct {
+    float *weight_ih, *weight_hh;      /* packed; weight_ih with the candidate's rows first */
+    float *before, *carried;           /* [BLOCK, H] */
+    float *gates;                      /* [BLOCK, 4 H] gradients: candidate, reset, update, candidate from the state */
+    float *candidate, *middle, *state; /* the same packed: [H], [2 H], [H] columns */
+    float *inputs_right, *before_right;
+    float *bias;                       /* [4 H] */
+} GruBackward;
+
+static GruBackward gru_backward_scratch(Arena *arena, long I, long H) {
+    GruBackward s;
+    s.weight_ih = take(arena, packed_size(3 * H, I));
+    s.weight_hh = take(arena, packed_size(3 * H, H));
+    s.before = take(arena, BLOCK * H);
+    s.carried = take(arena, BLOCK * H);
+    s.gates = take(arena, BLOCK * 4 * H);
+    s.candidate = take(arena, left_size(H));
+    s.middle = take(arena, left_size(2 * H));
+    s.state = take(arena, left_size(H));
+    s.inputs_right = take(arena, packed_size(DEPTH, I));
+    s.before_right = take(arena, packed_size(DEPTH, H));
+    s.bias = take(arena, 4 * H);
+    return s;
+}
+
+/* Gradients of what gru_forward computed, from those of its states; grad_inputs may be NULL. The other names as there. */
+int gru_backward(long L, long R, long I, long H, const float *inputs, const float *initial, const uint8_t *start,
+                 const float *weight_ih, const float *weight_hh, const float *states, const float *gates,
+                 const float *grad_states, float *grad_inputs, float *grad_initial, float *grad_weight_ih,
+                 float *grad_weight_hh, float *grad_bias_ih, float *grad_bias_hh) {
+    Arena arena = {0};
+    gru_backward_scratch(&arena, I, H);
+    if (!begin_arena(&arena))
+        return 1;
+    GruBackward s = gru_backward_scratch(&arena, I, H);
+    unsigned long mode = begin_flush();
+    for (long column = 0; column < I && grad_inputs; column += COLUMNS) {
+        float *panel = s.weight_ih + 3 * H * column;
+        const long columns = min(COLUMNS, I - column);
+        pack(H, columns, weight_ih + 2 * H * I + column, I, panel, H);
+        pack(2 * H, columns, weight_ih + column, I, panel + H * COLUMNS, 2 * H);
+    }
+    pack(3 * H, H, weight_hh, H, s.weight_hh, 3 * H);
+    memset(grad_weight_ih, 0, (size_t)(3 * H * I) * sizeof(float));
+    memset(grad_weight_hh, 0, (size_t)(3 * H * H) * sizeof(float));
+    memset(s.bias, 0, (size_t)(4 * H) * sizeof(float));
+    long filled = 0;
+    for (long first = 0; first < R; first += BLOCK) {
+        const long rows = min(BLOCK, R - first);
+        memset(s.carried, 0, (size_t)(rows * H) * sizeof(float));
+        for (long t = L - 1; t >= 0; t--) {
+            const long at = t * R + first;
+            state_before(rows, H, t ? states + (at - R) * H : initial + first * H, start + at, s.before);
+            for (long row = 0; row < rows; row++) {
+                const float *saved = gates + (at + row) * 4 * H, *incoming = grad_states + (at + row) * H;
+                float *out = s.gates + row * 4 * H, *carried = s.carried + row * H, *before = s.before + row * H;
+                for (long j = 0; j < H; j += LANES) {
+                    const long lanes = H - j;
+                    vec candidate = load_upto(saved + j, lanes), reset = load_upto(saved + H + j, lanes);
+                    vec update = load_upto(saved + 2 * H + j, lanes), from_state = load_upto(saved + 3 * H + j, lanes);
+                    vec grad = load_upto(carried + j, lanes) + load_upto(incoming + j, lanes);
+                    vec kept = grad * update;
+                    vec to_candidate = (grad - kept) * (all(1) - candidate * candidate);
+                    vec to_state = to_candidate * reset;
+                    vec to_reset = to_state * from_state * (all(1) - reset);
+                    vec to_update = kept * (load_upto(before + j, lanes) - candidate) * (all(1) - update);
+                    store_upto(carried + j, kept, lanes);
+                    store_upto(out + j, to_candidate, lanes);
+                    store_upto(out + H + j, to_reset, lanes);
+                    store_upto(out + 2 * H + j, to_update, lanes);
+                    store_upto(out + 3 * H + j, to_state, lanes);
+                    store_upto(s.bias + j, load_upto(s.bias + j, lanes) + to_candidate, lanes);
+                    store_upto(s.bias + H + j, load_upto(s.bias + H + j, lanes) + to_reset, lanes);
+                    store_upto(s.bias + 2 * H + j, load_upto(s.bias + 2 * H + j, lanes) + to_update, lanes);
+                    store_upto(s.bias + 3 * H + j, load_upto(s.bias + 3 * H + j, lanes) + to_state, lanes);
+                }
+            }
+            if (grad_inputs)
+                times_packed(rows, I, 3 * H, s.gates, 4 * H, s.weight_ih, grad_inputs + at * I, I, 0);
+            times_packed(rows, H, 3 * H, s.gates + H, 4 * H, s.weight_hh, s.carried, H, 1);
+            for (long row = 0; row < rows; row++)
+                if (start[at + row])
+                    memset(s.carried + row * H, 0, (size_t)H * sizeof(float));
+            pack_left(rows, H, s.gates, 4 * H, s.candidate + filled * ROWS);
+            pack_left(rows, 2 * H, s.gates + H, 4 * H, s.middle + filled * ROWS);
+            pack_left(rows, H, s.gates + 3 * H, 4 * H, s.state + filled * ROWS);
+            pack(rows, I, inputs + at * I, I, s.inputs_right + filled * COLUMNS, DEPTH);
+            pack(rows, H, s.before, H, s.before_right + filled * COLUMNS, DEPTH);
+            filled += rows;
+            const long next = t ? rows : min(BLOCK, R - first - rows);
+            if (filled + next > DEPTH || next <= 0) {
+                add_outer(2 * H, I, filled, s.middle, s.inputs_right, grad_weight_ih);
+                add_outer(H, I, filled, s.candidate, s.inputs_right, grad_weight_ih + 2 * H * I);
+                add_outer(2 * H, H, filled, s.middle, s.before_right, grad_weight_hh);
+                add_outer(H, H, filled, s.state, s.before_right, grad_weight_hh + 2 * H * H);
+                filled = 0;
+            }
+        }
+        memcpy(grad_initial + first * H, s.carried, (size_t)(rows * H) * sizeof(float));
+    }
+    memcpy(grad_bias_ih, s.bias + H, (size_t)(2 * H) * sizeof(float));
+    memcpy(grad_bias_ih + 2 * H, s.bias, (size_t)H * sizeof(float));
+    memcpy(grad_bias_hh, s.bias + H, (size_t)(3 * H) * sizeof(float));
+    end_flush(mode);
+    free(arena.base);
+    return 0;
+}
+
+/* [linear, activation, LayerNorm]. */
+
+INLINE vec activate(vec x, int activation) {
+    return activation == RELU ? choose(x < all(0), all(0), x) : activation == TANH ? tanh_of(x) : x;
+}
+
+/* d activate / dx from its result. */
+INLINE vec slope(vec activated, int activation) {
+    return activation == RELU   ? choose(activated > all(0), all(1), all(0))
+           : activation == TANH ? all(1) - activated * activated
+                                : all(1);
+}
+
+/* One row: from += bias, activated, into `activated` (unless NULL); normalised into y (unless scale is NULL). */
+INLINE void finish_row(long O, const int activation, const float *from, const float *bias, const float *scale,
+                       const float *shift, float *activated, float *statistics, float *y) {
+    vec sum = all(0);
+    for (long j = 0; j < O; j += LANES) {
+        vec x = load_upto(from + j, O - j);
+        if (bias)
+            x += load_upto(bias + j, O - j);
+        x = activate(x, activation);
+        sum += x;
+        if (activated)
+            store_upto(activated + j, x, O - j);
+    }
+    if (!scale)
+        return;
+    if (activated)
+        from = activated;
+    const float mean = sum_of(sum) / (float)O;
+    vec squares = all(0);
+    for (long j = 0; j < O; j += LANES) {
+        vec centred = load_upto(from + j, O - j) - all(mean);
+        if (O - j < LANES)
+            centred = load_upto((const float *)&centred, O - j); /* what is beyond the row must not count */
+        squares += centred * centred;
+    }
+    const float inverse_deviation = 1 / __builtin_sqrtf(sum_of(squares) / (float)O + 1e-5f);
+    for (long j = 0; j < O; j += LANES) {
+        vec normal = (load_upto(from + j, O - j) - all(mean)) * all(inverse_deviation);
+        store_upto(y + j, normal * load_upto(scale + j, O - j) + load_upto(shift + j, O - j), O - j);
+    }
+    if (statistics) {
+        statistics[0] = mean;
+        statistics[1] = inverse_deviation;
+    }
+}
+
+/* y[T, O] = LayerNorm(activation(x weight^T + bias)).
+ * x [T, I]. weight [O, I] and bias [O], or both NULL: x itself, I = O. scale, shift [O], or both NULL: no LayerNorm.
+ * For layer_backward: activated [T, O] and statistics [T, 2], or NULL; `activated` is not written, and need not be there,
+ * where it would equal x or y. Returns 0, or 1 if there is no memory. */
+int layer_forward(long T, long I, long O, int activation, const float *x, const float *weight, const float *bias,
+                  const float *scale, const float *shift, float *activated, float *statistics, float *y) {
+    Arena arena = {0};
+    take(&arena, weight ? packed_size(I, O) : 0);
+    if (!begin_arena(&arena))
+        return 1;
+    float *packed = take(&arena, weight ? packed_size(I, O) : 0);
+    unsigned long mode = begin_flush();
+    if (weight)
+        pack_transposed(I, O, weight, packed);
+    const int as_it_is = !weight && activation == IDENTITY;
+    for (long first = 0; first < T; first += BLOCK) {
+        const long rows = min(BLOCK, T - first);
+        float *middle = activated && scale && !as_it_is ? activated : y;
+        if (weight)
+            times_packed(rows, O, I, x + first * I, I, packed, middle + first * O, O, 0);
+        for (long row = first; row < first + rows; row++) {
+            const float *from = (weight ? middle : x) + row * O;
+            float *to = as_it_is && scale ? NULL : middle + row * O, *pair = statistics ? statistics + 2 * row : NULL;
+            if (activation == RELU)
+                finish_row(O, RELU, from, bias, scale, shift, to, pair, y + row * O);
+            else if (activation == TANH)
+                finish_row(O, TANH, from, bias, scale, shift, to, pair, y + row * O);
+            else
+                finish_row(O, IDENTITY, from, bias, scale, shift, to, pair, y + row * O);
+        }
+    }
+    end_flush(mode);
+    free(arena.base);
+    return 0;
+}
+
+INLINE void add_to(float *p, vec v, long n) { store_upto(p, load_upto(p, n) + v, n); }
+
+/* One row's gradient before the activation; adds to those of bias, scale and shift. */
+INLINE void row_backward(long O, const int activation, const float *activated, const float *statistics, const float *scale,
+                         const float *grad_y, float *grad, float *grad_bias, float *grad_scale, float *grad_shift) {
+    float mean = 0, inverse_deviation = 1, mean_grad = 0, mean_product = 0;
+    if (scale) {
+        mean = statistics[0], inverse_deviation = statistics[1];
+        vec sum = all(0), sum_product = all(0);
+        for (long j = 0; j < O; j += LANES) {
+            const long lanes = O - j;
+            vec incoming = load_upto(grad_y + j, lanes);
+            vec product = incoming * ((load_upto(activated + j, lanes) - all(mean)) * all(inverse_deviation));
+            vec factor = load_upto(scale + j, lanes);
+            sum += incoming * factor;
+            sum_product += product * factor;
+            add_to(grad_scale + j, product, lanes);
+            add_to(grad_shift + j, incoming, lanes);
+        }
+        mean_grad = sum_of(sum) / (float)O, mean_product = sum_of(sum_product) / (float)O;
+    }
+    for (long j = 0; j < O; j += LANES) {
+        const long lanes = O - j;
+        vec g = load_upto(grad_y + j, lanes), a = load_upto(activated + j, lanes);
+        if (scale) {
+            vec normal = (a - all(mean)) * all(inverse_deviation);
+            g = (g * load_upto(scale + j, lanes) - all(mean_grad) - normal * all(mean_product)) * all(inverse_deviation);
+        }
+        g *= slope(a, activation);
+        store_upto(grad + j, g, lanes);
+        if (grad_bias)
+            add_to(grad_bias + j, g, lanes);
+    }
+}
+
+typedef struct {
+    float *weight, *grad, *left, *right;
+} LayerBackward;
+
+static LayerBackward layer_backward_scratch(Arena *arena, long I, long O, int linear) {
+    LayerBackward s = {0};
+    s.grad = take(arena, BLOCK * O);
+    if (linear) {
+        s.weight = take(arena, packed_size(O, I));
+        s.left = take(arena, left_size(O));
+        s.right = take(arena, packed_size(DEPTH, I));
+    }
+    return s;
+}
+
+/* Gradients of what layer_forward computed, from that of y. Where it did not write `activated`, give x or y here. Those of
+ * a part that is not there are NULL; grad_x may be NULL if there is a weight. Returns 0, or 1 if there is no memory. */
+int layer_backward(long T, long I, long O, int activation, const float *x, const float *weight, const float *scale,
+                   const float *activated, const float *statistics, const float *grad_y, float *grad_x,
+                   float *grad_weight, float *grad_bias, float *grad_scale, float *grad_shift) {
+    Arena arena = {0};
+    layer_backward_scratch(&arena, I, O, weight != NULL);
+    if (!begin_arena(&arena))
+        return 1;
+    LayerBackward s = layer_backward_scratch(&arena, I, O, weight != NULL);
+    unsigned long mode = begin_flush();
+    if (weight) {
+        if (grad_x)
+            pack(O, I, weight, I, s.weight, O);
+        memset(grad_weight, 0, (size_t)(O * I) * sizeof(float));
+        memset(grad_bias, 0, (size_t)O * sizeof(float));
+    }
+    if (scale) {
+        memset(grad_scale, 0, (size_t)O * sizeof(float));
+        memset(grad_shift, 0, (size_t)O * sizeof(float));
+    }
+    long filled = 0;
+    for (long first = 0; first < T; first += BLOCK) {
+        const long rows = min(BLOCK, T - first);
+        float *grad = weight ? s.grad : grad_x + first * O;
+        for (long row = 0; row < rows; row++) {
+            const long at = first + row;
+            const float *pair = scale ? statistics + 2 * at : NULL;
+            if (activation == RELU)
+                row_backward(O, RELU, activated + at * O, pair, scale, grad_y + at * O, grad + row * O, grad_bias,
+                             grad_scale, grad_shift);
+            else if (activation == TANH)
+                row_backward(O, TANH, activated + at * O, pair, scale, grad_y + at * O, grad + row * O, grad_bias,
+                             grad_scale, grad_shift);
+            else
+                row_backward(O, IDENTITY, activated + at * O, pair, scale, grad_y + at * O, grad + row * O, grad_bias,
+                             grad_scale, grad_shift);
+        }
+        if (!weight)
+            continue;
+        if (grad_x)
+            times_packed(rows, I, O, grad, O, s.weight, grad_x + first * I, I, 0);
+        pack_left(rows, O, grad, O, s.left + filled * ROWS);
+        pack(rows, I, x + first * I, I, s.right + filled * COLUMNS, DEPTH);
+        filled += rows;
+        if (filled + BLOCK > DEPTH || first + rows == T) {
+            add_outer(O, I, filled, s.left, s.right, grad_weight);
+            filled = 0;
+        }
+    }
+    end_flush(mode);
+    free(arena.base);
+    return 0;
+}
