@@ -1,0 +1,272 @@
+"""Settings: declared once, checked by name and range, and the same again through YAML."""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings, strategies
+from hypothesis.strategies import SearchStrategy
+
+from dae_ros import config
+from dae_ros.config import SETTINGS, SettingInfo, Settings
+from dae_ros.errors import SettingsError
+
+REPOSITORY = Path(__file__).parent.parent
+TASK_FILES = sorted((REPOSITORY / 'config').glob('*.yaml'))
+NODE_GROUPS = (config.RunBinding, config.AgentSettings, config.ParameterServerSettings, config.TrainerSettings)
+DECLARATIONS = [*SETTINGS.values(), *config.declarations(*NODE_GROUPS)]
+RANGED = [info for info in DECLARATIONS if info.minimum is not None]
+
+# Reproduction facts: what is common to all experiments, and the step size and epochs of all but SMAC.
+PAPER = {
+    'gamma': 0.99, 'gae_lambda': 0.95, 'clip': 0.2, 'entropy_coefficient': 0.01, 'value_coefficient': 1.0,
+    'huber_delta': 10.0, 'adam_epsilon': 1e-5, 'max_gradient_norm': 10.0, 'num_mini_batches': 1, 'chunk_length': 10,
+    'epochs': 10, 'reward_network.epochs': 10, 'learning_rate': 7e-4, 'reward_network.learning_rate': 7e-4,
+    'hidden_size': 64, 'reward_network.hidden_size': 128, 'reward_network.ensemble_size': 1, 'mlp_layers': 2,
+    'activation': 'relu', 'value_target': 'difference', 'num_worlds': 128, 'num_steps': 25,
+}
+
+
+def by_name(declared: list[SettingInfo]):
+    return pytest.mark.parametrize('info', declared, ids=lambda info: info.name)
+
+
+def refusal(values: dict) -> str:
+    with pytest.raises(SettingsError) as caught:
+        config.from_flat(values)
+    return str(caught.value)
+
+
+def values_of(info: SettingInfo) -> SearchStrategy:
+    """All values the setting may take."""
+    if info.choices:
+        return strategies.sampled_from(info.choices)
+    if info.kind is bool:
+        return strategies.booleans()
+    if info.kind is int:
+        return strategies.integers(info.minimum, info.maximum)
+    if info.kind is float:
+        return strategies.floats(info.minimum, info.maximum)
+    return strategies.text()
+
+
+SOME_VALUES = strategies.fixed_dictionaries({}, optional={name: values_of(info) for name, info in SETTINGS.items()})
+
+
+def read_text(text: str | bytes) -> dict:
+    """What `load_task_file` makes of a file with this content."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / 'task.yaml'
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return config.load_task_file(path)
+
+
+def test_every_setting_has_a_public_name_of_its_own():
+    names = [info.name for info in DECLARATIONS]
+    assert len(names) == len(set(names))
+    groups = [getattr(Settings(), field.name) for field in dataclasses.fields(Settings)] + list(NODE_GROUPS)
+    assert len(names) == sum(len(dataclasses.fields(group)) for group in groups)
+
+
+@by_name(DECLARATIONS)
+def test_every_setting_is_explained_and_its_default_is_allowed(info):
+    assert info.help
+    assert info.help in info.describe() and info.unit in info.describe()
+    assert all(choice in info.describe() for choice in info.choices)
+    assert info.check(info.default) == info.default
+    assert type(info.check(info.default)) is info.kind
+
+
+def test_the_numbers_of_every_setting_are_bounded():
+    assert {info.name for info in DECLARATIONS if info.kind in (int, float)} == {info.name for info in RANGED}
+
+
+def test_the_defaults_are_those_of_the_paper():
+    defaults = config.flatten(Settings())
+    assert {name: defaults[name] for name in PAPER} == PAPER
+
+
+def test_nothing_set_gives_the_defaults():
+    assert config.from_flat({}) == Settings()
+
+
+@pytest.mark.parametrize('beta', [0, 1])
+def test_a_number_may_be_written_as_an_integer(beta):
+    taken = config.from_flat({'beta': beta}).learner.beta
+    assert taken == beta and type(taken) is float
+
+
+@pytest.mark.parametrize('value', [True, '0.5', None, [0.5], {'a': 1}], ids=repr)
+def test_a_number_takes_nothing_that_is_not_one_and_says_so(value):
+    assert refusal({'beta': value}) == f'beta must be a number, not {value!r}'
+
+
+@pytest.mark.parametrize('value', [True, 3.0, '3', None], ids=repr)
+def test_an_integer_takes_nothing_that_is_not_one_and_says_so(value):
+    assert refusal({'reward_network.epochs': value}) == f'reward_network.epochs must be an integer, not {value!r}'
+
+
+@pytest.mark.parametrize('value', [0, 1, 'true', None], ids=repr)
+def test_a_switch_takes_only_true_and_false(value):
+    assert refusal({'observe_others': value}) == f'observe_others must be true or false, not {value!r}'
+
+
+@pytest.mark.parametrize('value', [3, True, None], ids=repr)
+def test_a_text_takes_only_text(value):
+    assert refusal({'task': value}) == f'task must be a text, not {value!r}'
+
+
+@pytest.mark.parametrize('value', ['ReLU', '', 'identity'])
+def test_a_choice_takes_only_what_it_offers_and_names_that(value):
+    assert refusal({'activation': value}) == f'activation must be one of relu, tanh, not {value!r}'
+
+
+@by_name(RANGED)
+def test_the_bounds_of_a_range_are_allowed_and_what_lies_beyond_is_refused_by_name(info):
+    for bound in (info.minimum, info.maximum):
+        assert info.check(bound) == bound
+    for beyond in (info.minimum - 1, info.maximum * 2 + 1):
+        with pytest.raises(SettingsError) as caught:
+            info.check(beyond)
+        beyond = info.kind(beyond)
+        assert str(caught.value) == f'{info.name} must lie in {info.minimum} .. {info.maximum}, not {beyond!r}'
+
+
+@pytest.mark.parametrize('value', [float('nan'), float('inf'), float('-inf')], ids=repr)
+@by_name([info for info in RANGED if info.kind is float])
+def test_a_number_that_is_not_finite_is_refused(info, value):
+    with pytest.raises(SettingsError, match=f'^{info.name} must lie in .*, not {value!r}$'):
+        info.check(value)
+
+
+@pytest.mark.parametrize('wrong, meant', [
+    ('bta', 'beta'), ('num_world', 'num_worlds'), ('reward_network.epoch', 'reward_network.epochs'),
+    ('reward_network_learning_rate', 'reward_network.learning_rate'), ('value_targets', 'value_target')])
+def test_an_unknown_key_is_an_error_with_the_nearest_name(wrong, meant):
+    assert refusal({wrong: 1}) == f"unknown setting '{wrong}'; did you mean '{meant}'?"
+
+
+@pytest.mark.parametrize('name', ['', 'xyzzy', 'learner.beta'])
+def test_an_unknown_key_like_no_other_is_an_error_all_the_same(name):
+    assert refusal({name: 1}).startswith(f'unknown setting {name!r}')
+
+
+def test_a_setting_goes_to_the_group_it_belongs_to():
+    taken = config.from_flat({'epochs': 3, 'reward_network.epochs': 4, 'learning_rate': 0.5,
+                              'reward_network.hidden_size': 7})
+    assert (taken.learner.epochs, taken.reward_network.epochs) == (3, 4)
+    assert (taken.learner.learning_rate, taken.reward_network.learning_rate) == (0.5, 7e-4)
+    assert (taken.learner.hidden_size, taken.reward_network.hidden_size) == (64, 7)
+
+
+def test_what_is_not_set_stays_as_the_base_has_it():
+    base = config.from_flat({'beta': 0.5, 'seed': 7, 'num_agents': 2})
+    taken = config.from_flat({'beta': 0.25}, base)
+    assert config.flatten(taken) == config.flatten(base) | {'beta': 0.25}
+    assert base.learner.beta == 0.5
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(SOME_VALUES)
+def test_flattened_settings_are_those_that_were_set(values):
+    assert config.flatten(config.from_flat(values)) == config.flatten(Settings()) | values
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(SOME_VALUES)
+def test_settings_come_back_from_yaml_as_they_were(values):
+    written = config.from_flat(values)
+    assert config.from_flat(read_text(config.to_yaml(written))) == written
+
+
+@by_name([info for info in SETTINGS.values() if info.kind is not str])
+def test_the_digest_tells_every_change_of_a_setting(info):
+    changed = not info.default if info.kind is bool else info.maximum if info.default != info.maximum else info.minimum
+    other = config.from_flat({info.name: changed})
+    assert config.digest(other) != config.digest(Settings())
+    assert config.digest(config.from_flat({info.name: info.default})) == config.digest(Settings())
+
+
+def test_there_is_a_task_file_for_every_task_of_the_paper():
+    assert {'navigation.yaml', 'formation.yaml', 'line.yaml', 'matrix_game.yaml'} <= {path.name for path in TASK_FILES}
+
+
+@pytest.mark.parametrize('path', TASK_FILES, ids=lambda path: path.name)
+def test_every_task_file_loads_and_sets_what_it_says(path):
+    values = config.load_task_file(path)
+    flattened = config.flatten(config.from_flat(values))
+    assert values and {name: flattened[name] for name in values} == values
+
+
+def test_a_task_file_may_nest_a_group_or_write_its_names_with_dots():
+    nested = '/**:\n  ros__parameters:\n    beta: 1\n    reward_network:\n      epochs: 3\n'
+    dotted = '/**:\n  ros__parameters:\n    beta: 1\n    reward_network.epochs: 3\n'
+    assert read_text(nested) == read_text(dotted) == {'beta': 1, 'reward_network.epochs': 3}
+
+
+def under_parameters(text: str) -> str:
+    return f'/**:\n  ros__parameters:\n    {text}\n'
+
+
+MALFORMED = {
+    'empty': '',
+    'a comment': '# nothing\n',
+    'a number': '5',
+    'a list': '- beta: 1',
+    'no parameter file': 'beta: 1',
+    'of one node': 'trainer:\n  ros__parameters:\n    beta: 1',
+    'two nodes': under_parameters('beta: 1') + 'trainer:\n  ros__parameters:\n    beta: 1\n',
+    'no parameters': '/**:',
+    'parameters that are a number': '/**: 3',
+    'parameters under another key': '/**:\n  parameters:\n    beta: 1',
+    'parameters that are a list': '/**:\n  ros__parameters: [beta, 1]',
+    'two keys under the node': under_parameters('beta: 1') + '  more: 1\n',
+    'an open bracket': under_parameters('beta: [1'),
+    'a tabulator': '/**:\n\tros__parameters:\n\t\tbeta: 1\n',
+    'an object of a language': under_parameters('beta: !!python/object/apply:os.getcwd []'),
+    'an unknown anchor': under_parameters('beta: *nowhere'),
+    'a key that is a list': under_parameters('? [a, b]\n    : 1'),
+    'not UTF-8': b'/**:\n  ros__parameters:\n    task: \xff\xfe\n',
+    'a control character': '/**:\n  ros__parameters:\n    task: "\x00"\n',
+}
+
+
+@pytest.mark.parametrize('content', MALFORMED.values(), ids=MALFORMED)
+def test_a_malformed_task_file_is_answered_with_one_sentence_that_names_it(content, tmp_path):
+    path = tmp_path / 'task.yaml'
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(SettingsError) as caught:
+        config.load_task_file(path)
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_a_task_file_that_cannot_be_read_is_answered_with_one_sentence(tmp_path):
+    for path in (tmp_path / 'missing.yaml', tmp_path):
+        with pytest.raises(SettingsError, match=f'^cannot read the task file {path}: '):
+            config.load_task_file(path)
+
+
+@pytest.mark.parametrize('content, sentence', [
+    ('bta: 1', "unknown setting 'bta'; did you mean 'beta'?"),
+    ('reward_network: 5', "unknown setting 'reward_network'"),
+    ('beta: {epochs: 3}', "unknown setting 'beta.epochs'"),
+    ('reward_network: {beta: 1}', "unknown setting 'reward_network.beta'"),
+    ('7: 1', "unknown setting '7'"),
+    ('beta: "1"', "beta must be a number, not '1'"),
+    ('num_agents: 2.0', 'num_agents must be an integer, not 2.0')])
+def test_a_wrong_entry_of_a_task_file_is_an_error_that_names_it(content, sentence):
+    assert refusal(read_text(under_parameters(content))).startswith(sentence)
+
+
+@pytest.mark.parametrize('text, override', [
+    ('beta:=1', ('beta', 1)), ('beta:=0.5', ('beta', 0.5)), ('observe_others:=true', ('observe_others', True)),
+    ('task:=pettingzoo:mpe2.simple_spread_v3', ('task', 'pettingzoo:mpe2.simple_spread_v3'))])
+def test_an_override_is_a_name_and_a_value_read_as_yaml(text, override):
+    assert config.parse_override(text) == override
+
+
+@pytest.mark.parametrize('text', ['', 'beta', 'beta=1', ':=1', 'beta:1'])
+def test_an_override_of_another_form_is_an_error_that_shows_the_form(text):
+    with pytest.raises(SettingsError, match='^expected name:=value, not '):
+        config.parse_override(text)
