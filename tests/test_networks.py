@@ -1,0 +1,222 @@
+"""The networks: a GRU that is PyTorch's, a credit that ignores the agent's own action, and how all of them begin."""
+
+import math
+
+import pytest
+import torch
+
+from dae_ros.config import LearnerSettings, RewardNetworkSettings
+from dae_ros.learning.gru import gru_sequence
+from dae_ros.learning.networks import make_actor, make_critic, make_reward_network
+from dae_ros.types import WorldSpec
+
+SPEC = WorldSpec(num_agents=3, num_actions=4, observation_size=5, state_size=9, state_is_observations=False)
+LEARNER = LearnerSettings(hidden_size=16)
+REWARD = RewardNetworkSettings(hidden_size=24)
+
+
+def normal(*shape, seed=0, dtype=torch.float32):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+
+
+def starts(*shape, seed=0):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) < 0.3
+
+
+def reference_gru(inputs, initial, episode_start, weights):
+    """torch.nn.GRU, one step at a time, its state zeroed by hand; differentiable in everything."""
+    gru = torch.nn.GRU(inputs.shape[-1], initial.shape[-1]).double()
+    names = ('weight_ih_l0', 'weight_hh_l0', 'bias_ih_l0', 'bias_hh_l0')
+    state, states = initial.unsqueeze(0), []
+    for values, start in zip(inputs, episode_start):
+        state = state.masked_fill(start[None, :, None], 0)
+        _, state = torch.func.functional_call(gru, dict(zip(names, weights)), (values.unsqueeze(0), state))
+        states.append(state[0])
+    return torch.stack(states)
+
+
+@pytest.mark.parametrize('dtype, tolerance', [(torch.float32, 2e-5), (torch.float64, 1e-11)], ids=['32 bit', '64 bit'])
+@pytest.mark.parametrize('sizes', [(1, 1, 1, 1), (10, 7, 5, 16), (4, 300, 16, 24), (25, 3, 20, 9)], ids=str)
+def test_the_gru_is_torch_s_with_the_state_zeroed_at_episode_starts_gradients_included(sizes, dtype, tolerance):
+    steps, rows, inputs, hidden = sizes
+    shapes = [(steps, rows, inputs), (rows, hidden), (3 * hidden, inputs), (3 * hidden, hidden)] + [(3 * hidden,)] * 2
+    exact = [normal(*shape, seed=index, dtype=torch.float64) / math.sqrt(shape[-1])
+             for index, shape in enumerate(shapes)]
+    taken = [tensor.to(dtype).requires_grad_() for tensor in exact]
+    exact = [tensor.requires_grad_() for tensor in exact]
+    episode_start = starts(steps, rows)
+    expected = reference_gru(exact[0], exact[1], episode_start, exact[2:])
+    states = gru_sequence(taken[0], taken[1], episode_start, *taken[2:])
+    torch.testing.assert_close(states.double(), expected, rtol=tolerance, atol=tolerance)
+    direction = normal(*expected.shape, seed=9, dtype=torch.float64)
+    expected_gradients = torch.autograd.grad((expected * direction).sum(), exact)
+    gradients = torch.autograd.grad((states * direction.to(dtype)).sum(), taken)
+    for gradient, right in zip(gradients, expected_gradients):
+        assert gradient.dtype == dtype
+        scale = float(right.abs().max()) or 1.0
+        torch.testing.assert_close(gradient.double(), right, rtol=10 * tolerance, atol=10 * tolerance * scale)
+
+
+def test_no_gradient_passes_an_episode_start_backwards():
+    inputs, initial = normal(5, 2, 3).requires_grad_(), normal(2, 4, seed=1).requires_grad_()
+    weights = [normal(12, 3, seed=2), normal(12, 4, seed=3), normal(12, seed=4), normal(12, seed=5)]
+    episode_start = torch.tensor([[False, True]] + [[False, False]] * 2 + [[True, False]] + [[False, False]])
+    states = gru_sequence(inputs, initial, episode_start, *weights)
+    of_inputs, of_initial = torch.autograd.grad(states[-1].sum(), (inputs, initial))
+    assert (of_inputs[:3, 0] == 0).all() and (of_inputs[3:, 0] != 0).any(1).all()
+    assert (of_inputs[:, 1] != 0).any(1).all()
+    assert (of_initial == 0).all()
+    states = gru_sequence(inputs, initial, torch.zeros(5, 2, dtype=torch.bool), *weights)
+    assert (torch.autograd.grad(states[-1].sum(), initial)[0] != 0).any(1).all()
+
+
+def test_a_batch_without_rows_has_states_without_rows():
+    weights = [normal(12, 3), normal(12, 4), normal(12), normal(12)]
+    states = gru_sequence(torch.zeros(1, 0, 3), torch.zeros(0, 4), torch.zeros(1, 0, dtype=torch.bool), *weights)
+    assert states.shape == (1, 0, 4)
+
+
+def networks():
+    """Actor, critic and reward network, each as a function of part of its sequences, with rows and width of its GRU."""
+    actor, critic = make_actor(SPEC, LEARNER, 1), make_critic(SPEC, LEARNER, 1)
+    reward = make_reward_network(SPEC, REWARD, 1, 0)
+    states = normal(12, 6, SPEC.state_size)
+    values = normal(12, 6, SPEC.observation_size, seed=1)
+    actions = torch.randint(SPEC.num_actions, (12, 6, SPEC.num_agents), generator=torch.Generator().manual_seed(2))
+    return [
+        pytest.param(lambda a, b, *memory: actor(values[a:b], *memory), 6, LEARNER.hidden_size, id='actor'),
+        pytest.param(lambda a, b, *memory: critic(states[a:b], *memory), 6, LEARNER.hidden_size, id='critic'),
+        pytest.param(lambda a, b, *memory: reward(states[a:b], actions[a:b], *memory), 18, REWARD.hidden_size,
+                     id='reward network'),
+    ]
+
+
+@pytest.mark.parametrize('network, rows, hidden', networks())
+def test_a_sequence_cut_in_two_goes_on_from_the_state_of_the_first_part(network, rows, hidden):
+    with torch.no_grad():
+        initial = normal(rows, hidden, seed=7)
+        episode_start = starts(12, 6)
+        outputs, states = network(0, 12, initial, episode_start)
+        first, middle = network(0, 5, initial, episode_start[:5])
+        second, last = network(5, 12, middle[-1], episode_start[5:])
+    assert outputs.shape[:2] == (12, 6) and states.shape == (12, rows, hidden)
+    torch.testing.assert_close(torch.cat([first, second]), outputs, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(torch.cat([middle, last]), states, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize('network, rows, hidden', networks())
+def test_an_episode_begins_without_memory_of_the_one_before(network, rows, hidden):
+    episode_start = torch.zeros(12, 6, dtype=torch.bool)
+    episode_start[5] = True
+    with torch.no_grad():
+        whole, _ = network(0, 12, normal(rows, hidden, seed=7), episode_start)
+        alone, _ = network(5, 12, torch.zeros(rows, hidden), torch.zeros(7, 6, dtype=torch.bool))
+        other, _ = network(0, 12, normal(rows, hidden, seed=7), torch.zeros(12, 6, dtype=torch.bool))
+    torch.testing.assert_close(whole[5:], alone, rtol=1e-5, atol=1e-6)
+    assert ((other[5] - whole[5]).abs() > 1e-4 * whole[5].abs().max()).any()
+
+
+def predictions(network, states, actions, episode_start):
+    with torch.no_grad():
+        initial = torch.zeros(actions.shape[1] * SPEC.num_agents, REWARD.hidden_size)
+        return network(states, actions, initial, episode_start)[0]
+
+
+@pytest.mark.parametrize('agent', range(SPEC.num_agents))
+@pytest.mark.parametrize('when', [0, 3], ids=['past', 'current'])
+def test_the_reward_predicted_for_an_agent_depends_on_the_others_actions_and_not_on_its_own(agent, when):
+    network = make_reward_network(SPEC, REWARD, 1, 0)
+    states, episode_start = normal(4, 5, SPEC.state_size), torch.zeros(4, 5, dtype=torch.bool)
+    actions = torch.zeros(4, 5, SPEC.num_agents, dtype=torch.int64)
+    before = predictions(network, states, actions, episode_start)
+    assert before.shape == (4, 5, SPEC.num_agents, SPEC.num_actions)
+    for changed in range(SPEC.num_agents):
+        for action in range(1, SPEC.num_actions):
+            other = actions.clone()
+            other[when, :, changed] = action
+            difference = (predictions(network, states, other, episode_start) - before)[3, :, agent].abs().amax(-1)
+            if changed == agent:
+                assert (difference < 1e-5).all()
+            else:
+                assert (difference > 1e-3).all()
+
+
+def test_the_reward_predicted_tells_the_agents_and_their_actions_apart():
+    network = make_reward_network(SPEC, REWARD, 1, 0)
+    actions, episode_start = torch.zeros(1, 1, SPEC.num_agents, dtype=torch.int64), torch.ones(1, 1, dtype=torch.bool)
+    predicted = predictions(network, normal(1, 1, SPEC.state_size), actions, episode_start)[0, 0]
+    for one in range(SPEC.num_agents):
+        for other in range(one):
+            assert (predicted[one] - predicted[other]).abs().max() > 1e-3
+    assert (predicted.std(1) > 1e-3).all()
+
+
+def test_the_reward_predicted_depends_on_the_state():
+    network = make_reward_network(SPEC, REWARD, 1, 0)
+    actions, episode_start = torch.zeros(1, 1, SPEC.num_agents, dtype=torch.int64), torch.ones(1, 1, dtype=torch.bool)
+    states = (normal(1, 1, SPEC.state_size, seed=seed) for seed in (1, 2))
+    one, other = (predictions(network, state, actions, episode_start) for state in states)
+    assert ((one - other).abs().amax(-1) > 1e-3).all()
+
+
+def gain_of(weight):
+    """The g of a matrix whose rows, or columns if there are fewer of them, are orthogonal and of length g."""
+    rows = weight.detach().double()
+    rows = rows if rows.shape[0] <= rows.shape[1] else rows.t()
+    gain = float(rows[0].norm())
+    identity = torch.eye(len(rows), dtype=torch.float64)
+    torch.testing.assert_close(rows @ rows.t() / gain**2, identity, rtol=1e-5, atol=1e-5)
+    return gain
+
+
+@pytest.mark.parametrize('activation, gain', [('relu', math.sqrt(2)), ('tanh', 5 / 3)])
+@pytest.mark.parametrize('make, head_gain', [(make_actor, 0.01), (make_critic, 1.0)], ids=['actor', 'critic'])
+def test_actor_and_critic_begin_orthogonal_with_the_paper_s_gains(make, head_gain, activation, gain):
+    gains = {'mlp': gain, 'gru': 1.0, 'head': head_gain}
+    for name, parameter in make(SPEC, LearnerSettings(activation=activation), 1).named_parameters():
+        if parameter.dim() == 2:
+            assert gain_of(parameter) == pytest.approx(gains[name.split('.')[0]], rel=1e-4), name
+
+
+def test_the_reward_network_begins_orthogonal_with_a_head_of_gain_1():
+    for name, parameter in make_reward_network(SPEC, REWARD, 1, 0).named_parameters():
+        if parameter.dim() == 2:
+            expected = 1.0 if name.startswith(('gru', 'head')) else math.sqrt(2)
+            assert gain_of(parameter) == pytest.approx(expected, rel=1e-4), name
+
+
+@pytest.mark.parametrize('network', [
+    make_actor(SPEC, LEARNER, 1), make_critic(SPEC, LEARNER, 1), make_reward_network(SPEC, REWARD, 1, 0)],
+    ids=['actor', 'critic', 'reward network'])
+def test_biases_begin_at_0_and_layer_norms_as_the_identity(network):
+    for name, parameter in network.named_parameters():
+        if parameter.dim() == 1:
+            scale = 'norm' in name and name.endswith('weight')
+            assert (parameter == (1.0 if scale else 0.0)).all(), name
+
+
+def test_the_actor_begins_close_to_uniform():
+    with torch.no_grad():
+        logits, _ = make_actor(SPEC, LEARNER, 1)(normal(8, 50, 5), torch.zeros(50, 16), starts(8, 50))
+    assert (torch.softmax(logits, -1) - 1 / SPEC.num_actions).abs().max() < 0.02
+
+
+def flat(network):
+    return torch.cat([parameter.detach().reshape(-1) for parameter in network.parameters()])
+
+
+def test_a_network_begins_as_its_seed_and_its_name_say_and_nothing_else():
+    def make(seed):
+        return [make_actor(SPEC, LEARNER, seed), make_critic(SPEC, LEARNER, seed),
+                *(make_reward_network(SPEC, REWARD, seed, member) for member in range(2))]
+
+    first = [flat(network) for network in make(1)]
+    torch.manual_seed(7)
+    torch.rand(3)
+    for one, again, other in zip(first, make(1), make(2)):
+        assert torch.equal(one, flat(again))
+        assert not torch.equal(one, flat(other))
+    assert not torch.equal(first[2], first[3])
+    same_sizes = WorldSpec(3, 1, 9, 9, False)
+    actor, critic = make_actor(same_sizes, LEARNER, 1), make_critic(same_sizes, LEARNER, 1)
+    assert not torch.equal(actor.mlp[0].weight, critic.mlp[0].weight)
