@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import queue
 import signal
@@ -134,7 +133,7 @@ def main(args: list[str] | None = None) -> int:
                 train_in_process(settings, folder, display)
             else:
                 train_on_graph(settings, folder, arguments.namespace, display)
-        print(Summary(**json.loads(folder.summary_file.read_text())).lines())
+        print(Summary.read(folder.summary_file).lines())
         return 0
     except KeyboardInterrupt:
         print('stopped; every process is down', file=sys.stderr)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from dae_ros.errors import WorldError
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
 from dae_ros.worlds.yardsticks import yardstick_returns
@@ -15,7 +14,7 @@ YARDSTICK_EPISODES = 1000
 def write_report(training: Training, folder: RunFolder) -> None:
     """Writes summary.json, learning_curve.png and the pictures of an episode into the run's folder."""
     # Drawing libraries take a second to load, which a trainer does not need before its end.
-    from dae_ros.report.episode import draw_animation, draw_strip, record_episode
+    from dae_ros.report.episode import draw_animation, draw_strip, record_episodes
     from dae_ros.report.learning_curve import plot_learning_curve
     from dae_ros.report.metrics import read_metrics
     from dae_ros.report.summary import Summary
@@ -35,6 +34,7 @@ def write_report(training: Training, folder: RunFolder) -> None:
     summary.write(folder.summary_file)
     title = f'{task.task}, {task.num_agents} robots, beta {settings.learner.beta:g}, seed {settings.run.seed}'
     plot_learning_curve(read_metrics(folder.metrics_file), yardsticks, title, folder.path / 'learning_curve.png')
-    episode = record_episode(task, training.policy, settings.run.seed)
-    draw_strip(episode, folder.path / 'episode.png')
-    draw_animation(episode, folder.path / 'episode.gif')
+    episodes = record_episodes(task, training.policy, settings.run.seed)
+    draw_strip(episodes, folder.path / 'episode.png')
+    if episodes.positions is not None:
+        draw_animation(episodes, folder.path / 'episode.gif')

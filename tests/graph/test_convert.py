@@ -1,0 +1,80 @@
+"""Messages and arrays: what goes in comes out, and a message whose sizes do not add up is refused."""
+
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+import pytest
+from dae_ros_msgs import msg
+
+from dae_ros.errors import Refused
+from dae_ros.ros import convert
+from dae_ros.types import Action, JointState, Observation, PolicyWeights, RolloutRequest, SharedReward, Stamp
+
+STAMP = Stamp(run=7, rollout=3, attempt=1, step=24)
+RNG = np.random.default_rng(0)
+W, N, O, A, S = 4, 3, 6, 5, 7
+
+
+def same(first, second) -> None:
+    assert type(first) is type(second)
+    for one, other in zip(first, second):
+        if isinstance(one, np.ndarray):
+            assert one.dtype == other.dtype and one.shape == other.shape
+            np.testing.assert_array_equal(one, other)
+        else:
+            assert one == other
+
+
+def rows(*shape: int) -> np.ndarray:
+    return RNG.standard_normal(shape).astype(np.float32)
+
+
+def flags(*values: int) -> np.ndarray:
+    return np.array(values, bool)
+
+
+def test_every_kind_of_datum_survives_the_trip_through_its_message():
+    observation = Observation(STAMP, 2, 5, flags(1, 0, 1, 0), rows(W, O))
+    same(convert.observation(convert.observation_message(observation)), observation)
+    action = Action(STAMP, 2, 5, np.array([0, 4, 3, 1], np.uint16), rows(W, A))
+    same(convert.action(convert.action_message(action)), action)
+    joint = JointState(STAMP, flags(0, 0, 0, 1), rows(W, N, O), rows(W, S))
+    same(convert.joint_state(convert.joint_state_message(joint, False)), joint)
+    reward = SharedReward(STAMP, rows(W), flags(0, 1, 0, 0), flags(1, 0, 0, 1), rows(2, S))
+    same(convert.shared_reward(convert.shared_reward_message(reward)), reward)
+    request = RolloutRequest(7, 3, 1, 5, 2**63, 25, True)
+    same(convert.rollout_request(convert.rollout_request_message(request)), request)
+    weights = PolicyWeights(7, 5, 'ab', b'\x00\xff1')
+    same(convert.policy_weights(convert.policy_weights_message(weights)), weights)
+
+
+def test_a_state_that_is_the_observations_is_not_sent_twice():
+    observations = rows(W, N, O)
+    joint = JointState(STAMP, flags(1, 1, 1, 1), observations, observations.reshape(W, N * O))
+    message = convert.joint_state_message(joint, True)
+    assert len(message.state) == 0
+    same(convert.joint_state(message), joint)
+
+
+@pytest.mark.parametrize('changes', [
+    {'num_worlds': W + 1}, {'num_worlds': 0}, {'observation_size': 2**32 - 1}, {'values': array('f')},
+    {'episode_start': array('B', [1])},
+])
+def test_sizes_that_do_not_add_up_are_refused_before_anything_is_allocated(changes):
+    message = convert.observation_message(Observation(STAMP, 2, 5, flags(1, 0, 1, 0), rows(W, O)))
+    for name, value in changes.items():
+        setattr(message, name, value)
+    with pytest.raises(Refused) as refusal:
+        convert.observation(message)
+    assert refusal.value.reason == Refused.WRONG_SHAPE
+
+
+def test_an_empty_message_of_any_kind_is_refused_or_empty_but_never_a_crash():
+    for name in ('Observation', 'Action', 'JointState', 'SharedReward', 'RolloutRequest', 'PolicyWeights'):
+        lower = ''.join(f'_{letter.lower()}' if letter.isupper() else letter for letter in name).lstrip('_')
+        try:
+            getattr(convert, lower)(getattr(msg, name)())
+        except Refused:
+            pass

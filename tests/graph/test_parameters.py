@@ -1,0 +1,83 @@
+"""Parameters of the nodes: typed, described, range-checked; an unknown or mistyped key is an error that names it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from harness import TIMEOUT, Listener
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from rcl_interfaces.msg import Parameter, ParameterValue
+
+NODES = ('world', 'agent', 'parameter_server', 'trainer')
+
+
+def start(node: str, *arguments: str, cwd=None) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, '-m', f'dae_ros_nodes.{node}', '--ros-args', *arguments], cwd=cwd,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def failure(node: str, *arguments: str) -> str:
+    process = start(node, *arguments)
+    _, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 2, errors
+    assert 'Traceback' not in errors
+    return errors
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_an_unknown_key_is_an_error_that_names_it_and_the_nearest(node, domain):
+    assert "unknown setting 'num_agnets'; did you mean 'num_agents'?" in failure(node, '-p', 'num_agnets:=4')
+
+
+def test_an_unknown_key_in_a_parameter_file_is_an_error_too(domain, tmp_path):
+    file = tmp_path / 'task.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    reward_network:\n      hiden_size: 16\n')
+    assert "'reward_network.hiden_size'" in failure('world', '--params-file', str(file))
+
+
+@pytest.mark.parametrize('node, override, sentence', [
+    ('trainer', 'beta:=1.5', 'beta must lie in 0.0 .. 1.0, not 1.5'),
+    ('trainer', 'epochs:=many', "epochs must be an integer, not 'many'"),
+    ('world', 'num_agents:=0', 'num_agents must lie in 1 .. 1000, not 0'),
+    ('world', 'beta:=true', 'beta must be a number, not True'),
+    ('agent', 'robot:=first', "robot must be an integer, not 'first'"),
+    ('world', 'task:=soccer', "unknown task 'soccer'"),
+])
+def test_a_wrong_value_is_one_sentence(node, override, sentence, domain):
+    assert sentence in failure(node, '-p', override)
+
+
+def test_parameters_are_described_ranged_and_read_only_and_an_integer_beta_is_fine(domain, tmp_path):
+    process = start('trainer', '-p', 'beta:=1', '-p', f'run_folder:={tmp_path / "run"}', '-p', 'learner_threads:=1')
+    try:
+        with Listener() as listener:
+            value, = listener.call(GetParameters, 'trainer/get_parameters', GetParameters.Request(names=['beta'])).values
+            assert value.double_value == 1.0
+            descriptor, = listener.call(DescribeParameters, 'trainer/describe_parameters',
+                                        DescribeParameters.Request(names=['beta'])).descriptors
+            assert 'credit against bias' in descriptor.description and descriptor.read_only
+            assert (descriptor.floating_point_range[0].from_value, descriptor.floating_point_range[0].to_value) == (0.0, 1.0)
+            change = Parameter(name='beta', value=ParameterValue(type=3, double_value=0.5))
+            result, = listener.call(SetParameters, 'trainer/set_parameters', SetParameters.Request(parameters=[change])).results
+            assert not result.successful
+    finally:
+        process.terminate()
+        _, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 0 and 'Traceback' not in errors, errors
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_every_node_starts_alone_with_its_defaults_in_any_namespace_and_ends_on_request(node, domain, tmp_path):
+    process = start(node, '-r', '__ns:=/somewhere/deep', cwd=tmp_path)
+    try:
+        with Listener() as listener:
+            parameter = {'agent': 'robot', 'parameter_server': 'keep_policies'}.get(node, 'num_agents')
+            response = listener.call(GetParameters, f'/somewhere/deep/{node}/get_parameters',
+                                     GetParameters.Request(names=[parameter]))
+            assert response.values[0].type == 2
+    finally:
+        process.terminate()
+        _, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 0 and 'Traceback' not in errors, errors
