@@ -1,7 +1,7 @@
 """The native layers as differentiable torch operations, and whether they can be had here.
 
 `library` is chosen once, at import: the compiled kernels, or None where there is no C compiler or where the environment
-variable DAE_ROS_KERNELS is `torch`; then, and for tensors that are not float32 on the CPU, `networks` and `gru` compute the
+variable DAE_ROS_KERNELS is `torch`; then, and for tensors that are not float32 on the CPU, `networks` computes the
 same with torch's own operations. The two differ by rounding, so a run keeps to one of them. Calls give up Python's lock:
 threads run side by side.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import os
 import warnings
+from typing import NamedTuple, Sequence
 
 import torch
 from torch import Tensor
@@ -18,7 +19,19 @@ from torch.autograd.function import once_differentiable
 
 from dae_ros.learning.native.build import BuildError, library_path
 
-ACTIVATIONS = {'identity': 0, 'relu': 1, 'tanh': 2}
+_ACTIVATIONS = {'identity': 0, 'relu': 1, 'tanh': 2}
+
+# Sizes and addresses each kernel takes.
+_SIGNATURES = {'gru_forward': (4, 9), 'gru_backward': (4, 14), 'layer_forward': (4, 8), 'layer_backward': (4, 11),
+               'looked_up_forward': (3, 8), 'looked_up_backward': (4, 9)}
+
+
+class Step(NamedTuple):
+    """One step of a chain: a GRU, or LayerNorm(activation(x weight^T + bias)) of which any part may be left out."""
+
+    kind: str                                # 'gru', or the activation: 'identity', 'relu' or 'tanh'
+    parameters: tuple[Tensor | None, ...]    # of a GRU: weight_ih, weight_hh, bias_ih, bias_hh, as in `gru.gru_sequence`;
+    #                                          otherwise weight [O, I] and bias [O], scale and shift [O] of the LayerNorm
 
 
 def _load() -> ctypes.CDLL | None:
@@ -33,16 +46,12 @@ def _load() -> ctypes.CDLL | None:
     except (BuildError, OSError) as error:
         warnings.warn(f'the learner runs without its native kernels, several times slower: {error}', stacklevel=2)
         return None
-    for name, sizes, pointers in (('gru_forward', 4, 9), ('gru_backward', 4, 14), ('layer_forward', 3, 8),
-                                  ('layer_backward', 3, 11)):
+    for name, (sizes, pointers) in _SIGNATURES.items():
         function = getattr(loaded, name)
-        scalars = [ctypes.c_long] * sizes + ([ctypes.c_int] if name.startswith('layer') else [])
-        function.argtypes = scalars + [ctypes.c_void_p] * pointers
+        function.argtypes = [ctypes.c_long] * sizes + [ctypes.c_void_p] * pointers
         function.restype = ctypes.c_int
+    loaded.keep_freed_memory()
     return loaded
-
-
-library = _load()
 
 
 def available() -> bool:
@@ -55,107 +64,158 @@ def usable(*tensors: Tensor) -> bool:
     return library is not None and all(x.dtype == torch.float32 and x.device.type == 'cpu' for x in tensors)
 
 
-def _call(name: str, sizes: tuple[int, ...], *tensors: Tensor | None) -> None:
-    """Calls a kernel with the tensors' addresses; they must be contiguous."""
-    if getattr(library, name)(*sizes, *(None if x is None else x.data_ptr() for x in tensors)):
-        raise MemoryError(f'no memory for the scratch space of {name} at sizes {sizes}')
+def chain(steps: Sequence[Step], x: Tensor, initial: Tensor | None = None,
+          episode_start: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+    """The steps one after another, of which at most one is a GRU; then x is [L, R, I].
+
+    initial: the GRU's state before the first step [R, H]. episode_start: [L, R] bool; its state is zeroed before those
+    steps. Returns what the last step gives [..., O], and the GRU's states [L, R, H].
+    """
+    kinds = tuple(step.kind for step in steps)
+    parameters = [part for step in steps for part in step.parameters]
+    if _tracked(x, initial, *parameters):
+        return _Chain.apply(kinds, x, initial, episode_start, *parameters)
+    parameters = _contiguous(parameters)
+    x, initial, start = _contiguous((x, initial, episode_start))
+    states = None
+    for index, kind in enumerate(kinds):
+        own = parameters[4 * index:4 * index + 4]
+        if kind == 'gru':
+            x = states = _gru_forward(x, initial, start, own, None)
+        else:
+            x = _layer_forward(x, kind, own, None, None)
+    return x, states
+
+
+def looked_up(table: Tensor, codes: Tensor | None, shared: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+    """LayerNorm(relu(table[codes] + shared)), without writing down what is normalised.
+
+    table: [K, O]. codes: [M, N] int64 in 0 .. K - 1, or None: one row of the table after another, K = M N. shared: [M, O].
+    scale and shift [O]: of the LayerNorm. Returns [M, N, O].
+    """
+    if _tracked(table, shared, scale, shift):
+        return _LookedUp.apply(table, codes, shared, scale, shift)
+    table, codes, shared, scale, shift = _contiguous((table, codes, shared, scale, shift))
+    y = _looked_up_output(table, codes, shared)
+    _call('looked_up_forward', (y[..., 0].numel(), y.shape[1], y.shape[2]), codes, table, shared, scale, shift, y, None, y)
+    return y
+
+
+class _Chain(torch.autograd.Function):
+    """All steps in one operation: autograd's own work per operation would cost as much as a small layer."""
+
+    @staticmethod
+    def forward(ctx, kinds, x, initial, start, *parameters):
+        ctx.kinds = kinds
+        ctx.set_materialize_grads(False)
+        parameters = _contiguous(parameters)
+        x, initial, start = _contiguous((x, initial, start))
+        saved, states = [], None
+        for index, kind in enumerate(kinds):
+            own, inputs = parameters[4 * index:4 * index + 4], x
+            if kind == 'gru':
+                gates = x.new_empty(*x.shape[:2], 4 * initial.shape[1])
+                x = states = _gru_forward(inputs, initial, start, own, gates)
+                saved += [inputs, states, gates]
+            else:
+                weight, scale = own[0], own[2]
+                width = x.shape[-1] if weight is None else len(weight)
+                # The kernel writes `activated` only where it is neither the layer's input nor its output.
+                apart = scale is not None and (weight is not None or kind != 'identity')
+                activated = x.new_empty(*x.shape[:-1], width) if apart else None
+                statistics = None if scale is None else x.new_empty(*x.shape[:-1], 2)
+                x = _layer_forward(inputs, kind, own, activated, statistics)
+                saved += [inputs, activated if apart else x if scale is None else inputs, statistics]
+        ctx.save_for_backward(initial, start, *parameters, *saved)
+        return x, states
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad, grad_of_states):
+        initial, start, *rest = ctx.saved_tensors
+        parameters, saved = rest[:4 * len(ctx.kinds)], rest[4 * len(ctx.kinds):]
+        grads: list[Tensor | None] = [None] * len(parameters)
+        grad_initial = None
+        for index in reversed(range(len(ctx.kinds))):
+            kind, own = ctx.kinds[index], parameters[4 * index:4 * index + 4]
+            inputs, first, second = saved[3 * index:3 * index + 3]
+            if kind == 'gru' and grad_of_states is not None:
+                grad = grad_of_states if grad is None else grad + grad_of_states
+            if grad is None:
+                continue
+            grad, = _contiguous((grad,))
+            of_own = [None if part is None else torch.empty_like(part) for part in own]
+            # A layer without a product overwrites its input's gradient anyway, so there it is always computed.
+            of_inputs = torch.empty_like(inputs) if index or ctx.needs_input_grad[1] or own[0] is None else None
+            I, O = inputs.shape[-1], grad.shape[-1]
+            if kind == 'gru':
+                grad_initial = torch.empty_like(initial) if ctx.needs_input_grad[2] else None
+                _call('gru_backward', (*inputs.shape[:2], I, O), inputs, initial, start, own[0], own[1], first, second, grad,
+                      of_inputs, grad_initial, *of_own)
+            else:
+                _call('layer_backward', (inputs.numel() // I, I, O, _ACTIVATIONS[kind]), inputs, own[0], own[2], first,
+                      second, grad, of_inputs, *of_own)
+            grads[4 * index:4 * index + 4] = of_own
+            grad = of_inputs
+        return None, grad, grad_initial, None, *grads
+
+
+class _LookedUp(torch.autograd.Function):
+
+    @staticmethod
+    def forward(ctx, table, codes, shared, scale, shift):
+        table, codes, shared, scale, shift = _contiguous((table, codes, shared, scale, shift))
+        y = _looked_up_output(table, codes, shared)
+        activated, statistics = torch.empty_like(y), y.new_empty(*y.shape[:2], 2)
+        _call('looked_up_forward', (y[..., 0].numel(), y.shape[1], y.shape[2]), codes, table, shared, scale, shift, activated,
+              statistics, y)
+        ctx.table_rows = len(table)
+        ctx.save_for_backward(codes, scale, activated, statistics)
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        codes, scale, activated, statistics = ctx.saved_tensors
+        M, N, O = grad.shape
+        grad_table, grad_shared = grad.new_empty(ctx.table_rows, O), grad.new_empty(M, O)
+        grad_scale, grad_shift = torch.empty_like(scale), torch.empty_like(scale)
+        _call('looked_up_backward', (M * N, N, O, ctx.table_rows), codes, scale, activated, statistics, grad.contiguous(),
+              grad_table, grad_shared, grad_scale, grad_shift)
+        return grad_table, None, grad_shared, grad_scale, grad_shift
 
 
 def _tracked(*tensors: Tensor | None) -> bool:
     return torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
 
 
-class _Gru(torch.autograd.Function):
-
-    @staticmethod
-    def forward(ctx, inputs, initial, start, weight_ih, weight_hh, bias_ih, bias_hh):
-        inputs, initial, start = inputs.contiguous(), initial.contiguous(), start.contiguous()
-        weights = [x.contiguous() for x in (weight_ih, weight_hh)]
-        states, gates = _gru_forward(inputs, initial, start, *weights, bias_ih, bias_hh, save=True)
-        ctx.save_for_backward(inputs, initial, start, *weights, states, gates)
-        return states
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad_states):
-        inputs, initial, start, weight_ih, weight_hh, states, gates = ctx.saved_tensors
-        L, R, I = inputs.shape
-        grad_inputs = torch.empty_like(inputs) if ctx.needs_input_grad[0] else None
-        grads = [torch.empty_like(x) for x in (initial, weight_ih, weight_hh)] + [
-            inputs.new_empty(len(weight_hh)) for _ in range(2)]
-        _call('gru_backward', (L, R, I, initial.shape[1]), inputs, initial, start, weight_ih, weight_hh, states, gates,
-              grad_states.contiguous(), grad_inputs, *grads)
-        return grad_inputs, grads[0], None, *grads[1:]
+def _contiguous(tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
+    return [None if x is None else x.contiguous() for x in tensors]
 
 
-def _gru_forward(inputs, initial, start, weight_ih, weight_hh, bias_ih, bias_hh, save):
-    L, R, I = inputs.shape
-    H = initial.shape[1]
-    states = inputs.new_empty(L, R, H)
-    gates = inputs.new_empty(L, R, 4 * H) if save else None
-    _call('gru_forward', (L, R, I, H), inputs, initial, start, weight_ih, weight_hh, bias_ih.contiguous(),
-          bias_hh.contiguous(), states, gates)
-    return states, gates
+def _call(name: str, sizes: tuple[int, ...], *tensors: Tensor | None) -> None:
+    """Calls a kernel with the tensors' addresses; they must be contiguous."""
+    if getattr(library, name)(*sizes, *(None if x is None else x.data_ptr() for x in tensors)):
+        raise MemoryError(f'no memory for the scratch space of {name} at sizes {sizes}')
 
 
-def gru(inputs: Tensor, initial: Tensor, episode_start: Tensor, weight_ih: Tensor, weight_hh: Tensor, bias_ih: Tensor,
-        bias_hh: Tensor) -> Tensor:
-    """`gru.gru_sequence`, natively: same arguments, same result [L, R, H] to rounding."""
-    parts = (inputs, initial, episode_start, weight_ih, weight_hh, bias_ih, bias_hh)
-    if _tracked(*parts):
-        return _Gru.apply(*parts)
-    return _gru_forward(*(x.contiguous() for x in parts), save=False)[0]
+def _gru_forward(x, initial, start, parameters, gates):
+    states = x.new_empty(*x.shape[:2], initial.shape[1])
+    _call('gru_forward', (*x.shape, initial.shape[1]), x, initial, start, *parameters, states, gates)
+    return states
 
 
-class _Layer(torch.autograd.Function):
-
-    @staticmethod
-    def forward(ctx, x, weight, bias, activation, scale, shift):
-        x = x.contiguous()
-        weight, scale = (None if part is None else part.contiguous() for part in (weight, scale))
-        y, activated, statistics = _layer_forward(x, weight, bias, activation, scale, shift, save=True)
-        ctx.activation = activation
-        ctx.save_for_backward(x, weight, scale, activated, statistics)
-        return y
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad_y):
-        x, weight, scale, activated, statistics = ctx.saved_tensors
-        I, O = x.shape[-1], grad_y.shape[-1]
-        grad_x = torch.empty_like(x) if ctx.needs_input_grad[0] or weight is None else None
-        grad_weight, grad_bias = (None, None) if weight is None else (torch.empty_like(weight), x.new_empty(O))
-        grad_scale, grad_shift = (None, None) if scale is None else (x.new_empty(O), x.new_empty(O))
-        _call('layer_backward', (grad_y.numel() // O, I, O, ctx.activation), x, weight, scale, activated, statistics,
-              grad_y.contiguous(), grad_x, grad_weight, grad_bias, grad_scale, grad_shift)
-        return grad_x, grad_weight, grad_bias, None, grad_scale, grad_shift
-
-
-def _layer_forward(x, weight, bias, activation, scale, shift, save):
+def _layer_forward(x, activation, parameters, activated, statistics):
     I = x.shape[-1]
-    O = I if weight is None else len(weight)
-    rows = x.numel() // I
+    O = I if parameters[0] is None else len(parameters[0])
     y = x.new_empty(*x.shape[:-1], O)
-    activated = statistics = None
-    if save:
-        # The kernel writes `activated` only where it is neither the layer's input nor its output.
-        as_it_is = weight is None and activation == ACTIVATIONS['identity']
-        activated = y if scale is None else x if as_it_is else torch.empty_like(y)
-        statistics = None if scale is None else x.new_empty(rows, 2)
-    bias, scale, shift = (None if part is None else part.contiguous() for part in (bias, scale, shift))
-    _call('layer_forward', (rows, I, O, activation), x, weight, bias, scale, shift, activated, statistics, y)
-    return y, activated, statistics
+    _call('layer_forward', (x.numel() // I, I, O, _ACTIVATIONS[activation]), x, *parameters, activated, statistics, y)
+    return y
 
 
-def layer(x: Tensor, weight: Tensor | None, bias: Tensor | None, activation: str, scale: Tensor | None,
-          shift: Tensor | None) -> Tensor:
-    """LayerNorm(activation(x weight^T + bias)).
+def _looked_up_output(table, codes, shared):
+    rows = len(shared)
+    return table.new_empty(rows, len(table) // max(rows, 1) if codes is None else codes.shape[1], table.shape[1])
 
-    x: [..., I]. weight [O, I] and bias [O], or both None: x itself. activation: identity, relu or tanh. scale and shift
-    [O], or both None: no LayerNorm. Returns [..., O].
-    """
-    activation = ACTIVATIONS[activation]
-    if _tracked(x, weight, bias, scale, shift):
-        return _Layer.apply(x, weight, bias, activation, scale, shift)
-    weight = None if weight is None else weight.contiguous()
-    return _layer_forward(x.contiguous(), weight, bias, activation, scale, shift, save=False)[0]
+
+library = _load()

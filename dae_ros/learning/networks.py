@@ -6,7 +6,9 @@ rows of a sequence are worlds, or worlds times agents.
 
 from __future__ import annotations
 
+import functools
 import math
+from typing import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -16,20 +18,33 @@ from dae_ros import draws
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.learning import kernels
 from dae_ros.learning.gru import gru_sequence
+from dae_ros.learning.kernels import Step
 from dae_ros.types import WorldSpec
 
 _ACTIVATIONS = {'identity': lambda x: x, 'relu': torch.relu, 'tanh': torch.tanh}
 _GAINS = {'relu': math.sqrt(2), 'tanh': 5 / 3}
+_LOOK_UP_BELOW = 0.5  # a table of everything the others can do is used if it is at most this large, relative to the batch
 
 
-def _layer(x: Tensor, linear: nn.Linear | None = None, activation: str = 'identity', norm: nn.LayerNorm | None = None) -> Tensor:
+def layer(linear: nn.Linear | None = None, activation: str = 'identity', norm: nn.LayerNorm | None = None) -> Step:
     """norm(activation(linear(x))); what is None is left out."""
-    weight, bias = (None, None) if linear is None else (linear.weight, linear.bias)
-    scale, shift = (None, None) if norm is None else (norm.weight, norm.bias)
-    if kernels.usable(*(part for part in (x, weight, bias, scale, shift) if part is not None)):
-        return kernels.layer(x, weight, bias, activation, scale, shift)
-    x = _ACTIVATIONS[activation](x if linear is None else linear(x))
-    return x if norm is None else norm(x)
+    parameters = (None, None) if linear is None else (linear.weight, linear.bias)
+    return Step(activation, parameters + ((None, None) if norm is None else (norm.weight, norm.bias)))
+
+
+def run(steps: Sequence[Step], x: Tensor, initial: Tensor | None = None,
+        episode_start: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+    """`kernels.chain` by the fastest means there are; arguments and result as there."""
+    if kernels.usable(x, *(part for step in steps for part in step.parameters if part is not None)):
+        return kernels.chain(steps, x, initial, episode_start)
+    states = None
+    for kind, (first, second, third, fourth) in steps:
+        if kind == 'gru':
+            x = states = gru_sequence(x, initial, episode_start, first, second, third, fourth)
+        else:
+            x = _ACTIVATIONS[kind](x if first is None else functional.linear(x, first, second))
+            x = x if third is None else functional.layer_norm(x, third.shape, third, fourth)
+    return x, states
 
 
 class Gru(nn.Module):
@@ -42,8 +57,8 @@ class Gru(nn.Module):
         self.bias_ih = nn.Parameter(torch.empty(3 * hidden_size))
         self.bias_hh = nn.Parameter(torch.empty(3 * hidden_size))
 
-    def forward(self, inputs: Tensor, initial: Tensor, episode_start: Tensor) -> Tensor:
-        return gru_sequence(inputs, initial, episode_start, self.weight_ih, self.weight_hh, self.bias_ih, self.bias_hh)
+    def step(self) -> Step:
+        return Step('gru', (self.weight_ih, self.weight_hh, self.bias_ih, self.bias_hh))
 
 
 class RecurrentNetwork(nn.Module):
@@ -62,23 +77,35 @@ class RecurrentNetwork(nn.Module):
 
     def forward(self, inputs: Tensor, initial: Tensor, episode_start: Tensor) -> tuple[Tensor, Tensor]:
         """inputs [L, R, I], initial [R, H], episode_start [L, R] bool -> outputs [L, R, K], states [L, R, H]."""
-        x = _layer(inputs, norm=self.input_norm)
-        for linear, norm in zip(self.mlp, self.mlp_norm):
-            x = _layer(x, linear, self._activation, norm)
-        states = self.gru(x, initial, episode_start)
-        return _layer(_layer(states, norm=self.gru_norm), self.head), states
+        layers = [layer(linear, self._activation, norm) for linear, norm in zip(self.mlp, self.mlp_norm)]
+        steps = [layer(norm=self.input_norm), *layers, self.gru.step(), layer(norm=self.gru_norm), layer(self.head)]
+        return run(steps, inputs, initial, episode_start)
+
+
+@functools.lru_cache(maxsize=8)
+def _joint_actions_of_others(num_agents: int, num_actions: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Everything each agent's others can do, as one-hot blocks [N A^(N-1), N A] with the agent's own block zero. The row of
+    agent i at joint action a is sum_j a_j place[i, j] + first[i]; place [N, N], first [N]."""
+    N, A = num_agents, num_actions
+    weights = A ** torch.arange(N - 2, -1, -1, device=device)
+    digits = torch.arange(A ** (N - 1), device=device).unsqueeze(1) // weights % A
+    hot, zero = functional.one_hot(digits, A).float(), torch.zeros(len(digits), 1, A, device=device)
+    blocks = [torch.cat([hot[:, :i], zero, hot[:, i:]], 1).flatten(1) for i in range(N)]
+    place = [torch.cat([weights[:i], weights.new_zeros(1), weights[i:]]) for i in range(N)]
+    return torch.cat(blocks), torch.stack(place), torch.arange(N, device=device) * len(digits)
 
 
 class PerAgentRewardNetwork(nn.Module):
     """The paper's reward network (section 3.3): r_psi(s, a_-i, .) for every action of agent i, recurrent over a_-i.
 
     The zeroed block of agent i's own action is the only thing that tells the agents apart, so what depends on the state
-    alone is computed once per world.
+    alone is computed once per world, and what depends on the others' actions alone once for all they can do, where that
+    is less than the batch (75 rows for three agents with five actions).
     """
 
     def __init__(self, spec: WorldSpec, hidden_size: int):
         super().__init__()
-        self.num_actions = spec.num_actions
+        self.num_agents, self.num_actions = spec.num_agents, spec.num_actions
         self.action_embedding = nn.Parameter(torch.empty(spec.num_agents * spec.num_actions, hidden_size))
         self.action_bias = nn.Parameter(torch.empty(hidden_size))
         self.state = nn.Linear(spec.state_size, hidden_size)
@@ -94,13 +121,32 @@ class PerAgentRewardNetwork(nn.Module):
         """state [L, C, S], actions [L, C, N] int64, initial [C * N, H], episode_start [L, C] bool
         -> predicted rewards [L, C, N, A] for every own action, states [L, C * N, H]."""
         L, C, N = actions.shape
-        blocks = torch.arange(N, device=actions.device) * self.num_actions
-        embedded = functional.embedding(actions + blocks, self.action_embedding)
-        others = torch.relu(embedded.sum(2, keepdim=True) - embedded + self.action_bias)
-        seen = _layer(state, self.state, 'relu', self.state_norm)
-        joint = _layer(_layer(others, self.joint_action) + self.joint_state(seen).unsqueeze(2), None, 'relu', self.joint_norm)
-        states = self.gru(joint.view(L, C * N, -1), initial, episode_start.repeat_interleave(N, dim=1))
-        return _layer(_layer(states, norm=self.gru_norm), self.head).view(L, C, N, -1), states
+        seen, _ = run([layer(self.state, 'relu', self.state_norm), layer(self.joint_state)], state)
+        others, codes = self._others(actions.flatten(0, 1))
+        joint = self._joint(run([layer(self.joint_action)], others)[0], codes, seen.flatten(0, 1))
+        steps = [self.gru.step(), layer(norm=self.gru_norm), layer(self.head)]
+        predicted, states = run(steps, joint.view(L, C * N, -1), initial, episode_start.repeat_interleave(N, dim=1))
+        return predicted.view(L, C, N, -1), states
+
+    def _others(self, actions: Tensor) -> tuple[Tensor, Tensor | None]:
+        """First layer over the others' actions: rows [K, H], and which of them each agent has [M, N] for actions [M, N];
+        None if every agent has a row of its own, in order (K = M N)."""
+        N, A = self.num_agents, self.num_actions
+        if N * A ** (N - 1) <= _LOOK_UP_BELOW * actions.numel():
+            hot, place, first = _joint_actions_of_others(N, A, actions.device)
+            weights = self.action_embedding.t()
+            rows, _ = run([Step('relu', (weights, self.action_bias, None, None))], hot.to(weights.dtype))
+            return rows, (actions.unsqueeze(1) * place).sum(-1) + first
+        embedded = functional.embedding(actions + torch.arange(N, device=actions.device) * A, self.action_embedding)
+        return torch.relu(embedded.sum(1, keepdim=True) - embedded + self.action_bias).flatten(0, 1), None
+
+    def _joint(self, table: Tensor, codes: Tensor | None, seen: Tensor) -> Tensor:
+        """norm(relu(table[codes] + seen)): [M, N, H] for seen [M, H]."""
+        norm = self.joint_norm
+        if kernels.usable(table, seen, norm.weight):
+            return kernels.looked_up(table, codes, seen, norm.weight, norm.bias)
+        chosen = table.view(len(seen), self.num_agents, -1) if codes is None else functional.embedding(codes, table)
+        return norm(torch.relu(chosen + seen.unsqueeze(1)))
 
 
 def make_actor(spec: WorldSpec, settings: LearnerSettings, seed: int) -> RecurrentNetwork:

@@ -11,11 +11,14 @@
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
 #if defined(__SSE__)
-#include <xmmintrin.h>
+#include <immintrin.h>
 #endif
 
-enum { LANES = 8, ROWS = 6, COLUMNS = 2 * LANES, DEPTH = 256, BLOCK = 96 };
+enum { LANES = 8, ROWS = 6, COLUMNS = 2 * LANES, DEPTH = 256, BLOCK = 48 };
 enum { IDENTITY = 0, RELU = 1, TANH = 2 };
 
 typedef float vec __attribute__((vector_size(LANES * 4)));
@@ -48,39 +51,71 @@ INLINE void store_upto(float *p, vec v, long n) {
             p[i] = v[i];
 }
 
+/* Runs the statements for j = 0, LANES, ... < n; `lanes` is how many of the vector at j there are. */
+#define FOR_EACH_VECTOR(n, ...)                                                                                        \
+    do {                                                                                                               \
+        long j = 0;                                                                                                    \
+        for (; j + LANES <= (n); j += LANES) {                                                                         \
+            enum { lanes = LANES };                                                                                    \
+            __VA_ARGS__                                                                                                \
+        }                                                                                                              \
+        if (j < (n)) {                                                                                                 \
+            const long lanes = (n) - j;                                                                                \
+            __VA_ARGS__                                                                                                \
+        }                                                                                                              \
+    } while (0)
+
+INLINE void add_to(float *p, vec v, long n) { store_upto(p, load_upto(p, n) + v, n); }
+
 INLINE float sum_of(vec v) { return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7])); }
 
 INLINE vec choose(ivec condition, vec yes, vec no) {
     return (vec)((condition & (ivec)yes) | (~condition & (ivec)no));
 }
 
-/* e^y - 1 to full relative precision for |y| < 87: 2^k (e^f - 1) + (2^k - 1), the Taylor series on |f| <= ln(2) / 2. */
-INLINE vec expm1_of(vec y) {
+/* A NaN stays one. */
+INLINE vec clamp(vec x, float limit) {
+#if defined(__AVX__)
+    return _mm256_max_ps(all(-limit), _mm256_min_ps(all(limit), x));
+#else
+    x = choose(x > all(limit), all(limit), x);
+    return choose(x < all(-limit), all(-limit), x);
+#endif
+}
+
+/* Splits y = k ln(2) + f with |f| <= ln(2) / 2. Returns f; `power` takes k in the bits of a float's exponent. */
+INLINE vec reduce(vec y, ivec *power) {
     const vec round_to_integer = all(12582912.0f); /* 1.5 * 2^23: adding it leaves the integer in the low bits */
     vec shifted = y * all(1.44269504f) + round_to_integer;
     vec k = shifted - round_to_integer;
-    vec f = y - k * all(0.693359375f) + k * all(2.12194440e-4f);
-    vec series = all(1.0f / 5040);
-    series = series * f + all(1.0f / 720);
+    *power = (ivec)shifted << 23;
+    return y - k * all(0.693359375f) + k * all(2.12194440e-4f);
+}
+
+/* To 1e-7 relative; e^-x by its Chebyshev polynomial of degree 5. */
+INLINE vec sigmoid_of(vec x) {
+    ivec power;
+    vec f = reduce(clamp(-x, 87), &power);
+    vec e = f * all(0.008296807f) + all(0.04194099f);
+    e = e * f + all(0.16667749f);
+    e = e * f + all(0.4999862f);
+    e = e * f + all(0.9999996f);
+    e = e * f + all(1.0000001f);
+    return all(1) / (all(1) + (vec)((ivec)e + power));
+}
+
+/* To 1e-7 relative, near zero too: (e^2x - 1) / (e^2x + 1), with e^2x - 1 = 2^k (e^f - 1) + (2^k - 1). */
+INLINE vec tanh_of(vec x) {
+    ivec power;
+    vec f = reduce(clamp(x + x, 40), &power);
+    vec series = f * all(1.0f / 5040) + all(1.0f / 720);
     series = series * f + all(1.0f / 120);
     series = series * f + all(1.0f / 24);
     series = series * f + all(1.0f / 6);
     series = series * f + all(0.5f);
     series = series * (f * f) + f;
-    vec scale = (vec)(((ivec)shifted << 23) + 0x3f800000); /* the shift drops the constant's own bits */
-    return scale * series + (scale - all(1));
-}
-
-/* Comparisons keep a NaN. */
-INLINE vec clamp(vec x, float limit) {
-    x = choose(x > all(limit), all(limit), x);
-    return choose(x < all(-limit), all(-limit), x);
-}
-
-INLINE vec sigmoid_of(vec x) { return all(1) / (all(2) + expm1_of(clamp(-x, 87))); }
-
-INLINE vec tanh_of(vec x) {
-    vec e = expm1_of(clamp(x + x, 40));
+    vec scale = (vec)(power + 0x3f800000);
+    vec e = scale * series + (scale - all(1));
     return e / (e + all(2));
 }
 
@@ -107,6 +142,15 @@ static void end_flush(unsigned long mode) {
     __asm__ volatile("msr fpcr, %0" ::"r"(mode));
 #else
     (void)mode;
+#endif
+}
+
+/* Makes the process keep memory it has freed: the learner allocates the same megabytes for every shard, and giving them
+ * back in between costs a page fault per four kilobytes. */
+void keep_freed_memory(void) {
+#if defined(__GLIBC__)
+    mallopt(M_MMAP_THRESHOLD, 32 << 20);
+    mallopt(M_TRIM_THRESHOLD, 1 << 30);
 #endif
 }
 
@@ -246,15 +290,14 @@ enum { LEFT_PANEL = DEPTH * ROWS + LANES };
 static long left_size(long M) { return round_up(M, ROWS) / ROWS * LEFT_PANEL; }
 
 static void pack_left(long K, long M, const float *matrix, long ld, float *panels) {
-    for (long column = 0; column < M; column += ROWS, panels += LEFT_PANEL) {
-        const float *from = matrix + column;
-        if (M - column >= LANES) /* whole vectors: each overwrites what the one before had too much */
-            for (long k = 0; k < K; k++)
-                store(panels + k * ROWS, load(from + k * ld));
-        else
-            for (long k = 0; k < K; k++)
-                for (long i = 0; i < ROWS; i++)
-                    panels[k * ROWS + i] = column + i < M ? from[k * ld + i] : 0;
+    for (long k = 0; k < K; k++, matrix += ld, panels += ROWS) {
+        float *to = panels;
+        long column = 0;
+        for (; column + LANES <= M; column += ROWS, to += LEFT_PANEL) /* the next row overwrites what is too much */
+            store(to, load(matrix + column));
+        for (; column < M; column += ROWS, to += LEFT_PANEL)
+            for (long i = 0; i < ROWS; i++)
+                to[i] = column + i < M ? matrix[column + i] : 0;
     }
 }
 
@@ -302,6 +345,38 @@ static GruForward gru_forward_scratch(Arena *arena, long I, long H) {
     return s;
 }
 
+/* Gates, candidate and new state of a panel of at most COLUMNS units; products as in GruForward. In two passes, so that
+ * the processor has many short chains of operations to overlap. */
+static void gates_panel(long rows, long columns, long H, float *products, const float *before, const float *bias_ih,
+                        const float *bias_hh, float *states, float *gates) {
+    float *const update_products = products + BLOCK * COLUMNS;
+    const float *const from_inputs = products + 2 * BLOCK * COLUMNS, *const from_states = products + 3 * BLOCK * COLUMNS;
+    FOR_EACH_VECTOR(columns, {
+        const vec reset_bias = load_upto(bias_ih + j, lanes) + load_upto(bias_hh + j, lanes);
+        const vec update_bias = load_upto(bias_ih + H + j, lanes) + load_upto(bias_hh + H + j, lanes);
+        const vec input_bias = load_upto(bias_ih + 2 * H + j, lanes), state_bias = load_upto(bias_hh + 2 * H + j, lanes);
+        for (long at = j; at < rows * COLUMNS; at += COLUMNS) {
+            store(products + at, sigmoid_of(load(products + at) + reset_bias));
+            store(update_products + at, sigmoid_of(load(update_products + at) + update_bias));
+        }
+        for (long row = 0; row < rows; row++) {
+            const long at = row * COLUMNS + j;
+            vec reset = load(products + at), update = load(update_products + at);
+            vec from_state = load(from_states + at) + state_bias;
+            vec candidate = tanh_of(load(from_inputs + at) + input_bias + reset * from_state);
+            vec old = load_upto(before + row * H + j, lanes);
+            store_upto(states + row * H + j, candidate + update * (old - candidate), lanes);
+            if (gates) {
+                float *saved = gates + row * 4 * H + j;
+                store_upto(saved, candidate, lanes);
+                store_upto(saved + H, reset, lanes);
+                store_upto(saved + 2 * H, update, lanes);
+                store_upto(saved + 3 * H, from_state, lanes);
+            }
+        }
+    });
+}
+
 /* States [L, R, H] after each step; gates, unless NULL: [L, R, 4 H] candidate, reset, update, candidate from the state.
  * inputs [L, R, I], initial [R, H], start [L, R], weight_ih [3 H, I], weight_hh [3 H, H], bias_ih, bias_hh [3 H] in the
  * order reset, update, candidate. Returns 0, or 1 if there is no memory. */
@@ -335,29 +410,8 @@ int gru_forward(long L, long R, long I, long H, const float *inputs, const float
                     times_panel(rows, I, x, I, weights, from_input, COLUMNS, 0);
                     times_panel(rows, H, s.before, H, weights + I * COLUMNS, from_state, COLUMNS, gate < 2);
                 }
-                for (long half = 0; half < COLUMNS && column + half < H; half += LANES) {
-                    const long j = column + half, lanes = H - j;
-                    const vec reset_bias = load_upto(bias_ih + j, lanes) + load_upto(bias_hh + j, lanes);
-                    const vec update_bias = load_upto(bias_ih + H + j, lanes) + load_upto(bias_hh + H + j, lanes);
-                    const vec input_bias = load_upto(bias_ih + 2 * H + j, lanes);
-                    const vec state_bias = load_upto(bias_hh + 2 * H + j, lanes);
-                    const float *product = s.products + half;
-                    for (long row = 0; row < rows; row++, product += COLUMNS) {
-                        vec reset = sigmoid_of(load(product) + reset_bias);
-                        vec update = sigmoid_of(load(product + BLOCK * COLUMNS) + update_bias);
-                        vec from_state = load(product + 3 * BLOCK * COLUMNS) + state_bias;
-                        vec candidate = tanh_of(load(product + 2 * BLOCK * COLUMNS) + input_bias + reset * from_state);
-                        vec before = load_upto(s.before + row * H + j, lanes);
-                        store_upto(states + (at + row) * H + j, candidate + update * (before - candidate), lanes);
-                        if (gates) {
-                            float *saved = gates + (at + row) * 4 * H + j;
-                            store_upto(saved, candidate, lanes);
-                            store_upto(saved + H, reset, lanes);
-                            store_upto(saved + 2 * H, update, lanes);
-                            store_upto(saved + 3 * H, from_state, lanes);
-                        }
-                    }
-                }
+                gates_panel(rows, min(COLUMNS, H - column), H, s.products, s.before + column, bias_ih + column,
+                            bias_hh + column, states + at * H + column, gates ? gates + at * 4 * H + column : NULL);
             }
         }
     }
@@ -391,7 +445,8 @@ static GruBackward gru_backward_scratch(Arena *arena, long I, long H) {
     return s;
 }
 
-/* Gradients of what gru_forward computed, from those of its states; grad_inputs may be NULL. The other names as there. */
+/* Gradients of what gru_forward computed, from those of its states; the other names as there.
+ * grad_inputs and grad_initial may be NULL. */
 int gru_backward(long L, long R, long I, long H, const float *inputs, const float *initial, const uint8_t *start,
                  const float *weight_ih, const float *weight_hh, const float *states, const float *gates,
                  const float *grad_states, float *grad_inputs, float *grad_initial, float *grad_weight_ih,
@@ -422,8 +477,7 @@ int gru_backward(long L, long R, long I, long H, const float *inputs, const floa
             for (long row = 0; row < rows; row++) {
                 const float *saved = gates + (at + row) * 4 * H, *incoming = grad_states + (at + row) * H;
                 float *out = s.gates + row * 4 * H, *carried = s.carried + row * H, *before = s.before + row * H;
-                for (long j = 0; j < H; j += LANES) {
-                    const long lanes = H - j;
+                FOR_EACH_VECTOR(H, {
                     vec candidate = load_upto(saved + j, lanes), reset = load_upto(saved + H + j, lanes);
                     vec update = load_upto(saved + 2 * H + j, lanes), from_state = load_upto(saved + 3 * H + j, lanes);
                     vec grad = load_upto(carried + j, lanes) + load_upto(incoming + j, lanes);
@@ -437,15 +491,16 @@ int gru_backward(long L, long R, long I, long H, const float *inputs, const floa
                     store_upto(out + H + j, to_reset, lanes);
                     store_upto(out + 2 * H + j, to_update, lanes);
                     store_upto(out + 3 * H + j, to_state, lanes);
-                    store_upto(s.bias + j, load_upto(s.bias + j, lanes) + to_candidate, lanes);
-                    store_upto(s.bias + H + j, load_upto(s.bias + H + j, lanes) + to_reset, lanes);
-                    store_upto(s.bias + 2 * H + j, load_upto(s.bias + 2 * H + j, lanes) + to_update, lanes);
-                    store_upto(s.bias + 3 * H + j, load_upto(s.bias + 3 * H + j, lanes) + to_state, lanes);
-                }
+                    add_to(s.bias + j, to_candidate, lanes);
+                    add_to(s.bias + H + j, to_reset, lanes);
+                    add_to(s.bias + 2 * H + j, to_update, lanes);
+                    add_to(s.bias + 3 * H + j, to_state, lanes);
+                });
             }
             if (grad_inputs)
                 times_packed(rows, I, 3 * H, s.gates, 4 * H, s.weight_ih, grad_inputs + at * I, I, 0);
-            times_packed(rows, H, 3 * H, s.gates + H, 4 * H, s.weight_hh, s.carried, H, 1);
+            if (t || grad_initial)
+                times_packed(rows, H, 3 * H, s.gates + H, 4 * H, s.weight_hh, s.carried, H, 1);
             for (long row = 0; row < rows; row++)
                 if (start[at + row])
                     memset(s.carried + row * H, 0, (size_t)H * sizeof(float));
@@ -464,7 +519,8 @@ int gru_backward(long L, long R, long I, long H, const float *inputs, const floa
                 filled = 0;
             }
         }
-        memcpy(grad_initial + first * H, s.carried, (size_t)(rows * H) * sizeof(float));
+        if (grad_initial)
+            memcpy(grad_initial + first * H, s.carried, (size_t)(rows * H) * sizeof(float));
     }
     memcpy(grad_bias_ih, s.bias + H, (size_t)(2 * H) * sizeof(float));
     memcpy(grad_bias_ih + 2 * H, s.bias, (size_t)H * sizeof(float));
@@ -491,32 +547,32 @@ INLINE vec slope(vec activated, int activation) {
 INLINE void finish_row(long O, const int activation, const float *from, const float *bias, const float *scale,
                        const float *shift, float *activated, float *statistics, float *y) {
     vec sum = all(0);
-    for (long j = 0; j < O; j += LANES) {
-        vec x = load_upto(from + j, O - j);
+    FOR_EACH_VECTOR(O, {
+        vec x = load_upto(from + j, lanes);
         if (bias)
-            x += load_upto(bias + j, O - j);
+            x += load_upto(bias + j, lanes);
         x = activate(x, activation);
         sum += x;
         if (activated)
-            store_upto(activated + j, x, O - j);
-    }
+            store_upto(activated + j, x, lanes);
+    });
     if (!scale)
         return;
     if (activated)
         from = activated;
     const float mean = sum_of(sum) / (float)O;
     vec squares = all(0);
-    for (long j = 0; j < O; j += LANES) {
-        vec centred = load_upto(from + j, O - j) - all(mean);
-        if (O - j < LANES)
-            centred = load_upto((const float *)&centred, O - j); /* what is beyond the row must not count */
+    FOR_EACH_VECTOR(O, {
+        vec centred = load_upto(from + j, lanes) - all(mean);
+        if ((long)lanes < LANES)
+            centred = load_upto((const float *)&centred, lanes); /* what is beyond the row must not count */
         squares += centred * centred;
-    }
+    });
     const float inverse_deviation = 1 / __builtin_sqrtf(sum_of(squares) / (float)O + 1e-5f);
-    for (long j = 0; j < O; j += LANES) {
-        vec normal = (load_upto(from + j, O - j) - all(mean)) * all(inverse_deviation);
-        store_upto(y + j, normal * load_upto(scale + j, O - j) + load_upto(shift + j, O - j), O - j);
-    }
+    FOR_EACH_VECTOR(O, {
+        vec normal = (load_upto(from + j, lanes) - all(mean)) * all(inverse_deviation);
+        store_upto(y + j, normal * load_upto(scale + j, lanes) + load_upto(shift + j, lanes), lanes);
+    });
     if (statistics) {
         statistics[0] = mean;
         statistics[1] = inverse_deviation;
@@ -524,10 +580,10 @@ INLINE void finish_row(long O, const int activation, const float *from, const fl
 }
 
 /* y[T, O] = LayerNorm(activation(x weight^T + bias)).
- * x [T, I]. weight [O, I] and bias [O], or both NULL: x itself, I = O. scale, shift [O], or both NULL: no LayerNorm.
+ * x [T, I]. weight [O, I] or NULL: x itself, I = O. bias [O] or NULL. scale, shift [O], or both NULL: no LayerNorm.
  * For layer_backward: activated [T, O] and statistics [T, 2], or NULL; `activated` is not written, and need not be there,
  * where it would equal x or y. Returns 0, or 1 if there is no memory. */
-int layer_forward(long T, long I, long O, int activation, const float *x, const float *weight, const float *bias,
+int layer_forward(long T, long I, long O, long activation, const float *x, const float *weight, const float *bias,
                   const float *scale, const float *shift, float *activated, float *statistics, float *y) {
     Arena arena = {0};
     take(&arena, weight ? packed_size(I, O) : 0);
@@ -559,8 +615,6 @@ int layer_forward(long T, long I, long O, int activation, const float *x, const 
     return 0;
 }
 
-INLINE void add_to(float *p, vec v, long n) { store_upto(p, load_upto(p, n) + v, n); }
-
 /* One row's gradient before the activation; adds to those of bias, scale and shift. */
 INLINE void row_backward(long O, const int activation, const float *activated, const float *statistics, const float *scale,
                          const float *grad_y, float *grad, float *grad_bias, float *grad_scale, float *grad_shift) {
@@ -568,8 +622,7 @@ INLINE void row_backward(long O, const int activation, const float *activated, c
     if (scale) {
         mean = statistics[0], inverse_deviation = statistics[1];
         vec sum = all(0), sum_product = all(0);
-        for (long j = 0; j < O; j += LANES) {
-            const long lanes = O - j;
+        FOR_EACH_VECTOR(O, {
             vec incoming = load_upto(grad_y + j, lanes);
             vec product = incoming * ((load_upto(activated + j, lanes) - all(mean)) * all(inverse_deviation));
             vec factor = load_upto(scale + j, lanes);
@@ -577,11 +630,10 @@ INLINE void row_backward(long O, const int activation, const float *activated, c
             sum_product += product * factor;
             add_to(grad_scale + j, product, lanes);
             add_to(grad_shift + j, incoming, lanes);
-        }
+        });
         mean_grad = sum_of(sum) / (float)O, mean_product = sum_of(sum_product) / (float)O;
     }
-    for (long j = 0; j < O; j += LANES) {
-        const long lanes = O - j;
+    FOR_EACH_VECTOR(O, {
         vec g = load_upto(grad_y + j, lanes), a = load_upto(activated + j, lanes);
         if (scale) {
             vec normal = (a - all(mean)) * all(inverse_deviation);
@@ -591,7 +643,7 @@ INLINE void row_backward(long O, const int activation, const float *activated, c
         store_upto(grad + j, g, lanes);
         if (grad_bias)
             add_to(grad_bias + j, g, lanes);
-    }
+    });
 }
 
 typedef struct {
@@ -611,7 +663,7 @@ static LayerBackward layer_backward_scratch(Arena *arena, long I, long O, int li
 
 /* Gradients of what layer_forward computed, from that of y. Where it did not write `activated`, give x or y here. Those of
  * a part that is not there are NULL; grad_x may be NULL if there is a weight. Returns 0, or 1 if there is no memory. */
-int layer_backward(long T, long I, long O, int activation, const float *x, const float *weight, const float *scale,
+int layer_backward(long T, long I, long O, long activation, const float *x, const float *weight, const float *scale,
                    const float *activated, const float *statistics, const float *grad_y, float *grad_x,
                    float *grad_weight, float *grad_bias, float *grad_scale, float *grad_shift) {
     Arena arena = {0};
@@ -624,8 +676,9 @@ int layer_backward(long T, long I, long O, int activation, const float *x, const
         if (grad_x)
             pack(O, I, weight, I, s.weight, O);
         memset(grad_weight, 0, (size_t)(O * I) * sizeof(float));
-        memset(grad_bias, 0, (size_t)O * sizeof(float));
     }
+    if (grad_bias)
+        memset(grad_bias, 0, (size_t)O * sizeof(float));
     if (scale) {
         memset(grad_scale, 0, (size_t)O * sizeof(float));
         memset(grad_shift, 0, (size_t)O * sizeof(float));
@@ -661,5 +714,41 @@ int layer_backward(long T, long I, long O, int activation, const float *x, const
     }
     end_flush(mode);
     free(arena.base);
+    return 0;
+}
+
+/* y[T, O] = LayerNorm(relu(table[code] + shared[row / N])), row by row.
+ * table [K, O]. codes [T] in 0 .. K - 1, or NULL: code = row. shared [T / N, O]. scale, shift [O]. For
+ * looked_up_backward: activated [T, O] and statistics [T, 2]; statistics may be NULL, activated may be y. */
+int looked_up_forward(long T, long N, long O, const int64_t *codes, const float *table, const float *shared,
+                      const float *scale, const float *shift, float *activated, float *statistics, float *y) {
+    unsigned long mode = begin_flush();
+    for (long row = 0; row < T; row++)
+        finish_row(O, RELU, table + (codes ? codes[row] : row) * O, shared + row / N * O, scale, shift, activated + row * O,
+                   statistics ? statistics + 2 * row : NULL, y + row * O);
+    end_flush(mode);
+    return 0;
+}
+
+/* Gradients of what looked_up_forward computed, from that of y; grad_table [K, O]. Returns 0, or 1 without memory. */
+int looked_up_backward(long T, long N, long O, long K, const int64_t *codes, const float *scale, const float *activated,
+                       const float *statistics, const float *grad_y, float *grad_table, float *grad_shared,
+                       float *grad_scale, float *grad_shift) {
+    float *grad = malloc((size_t)O * sizeof(float));
+    if (!grad)
+        return 1;
+    unsigned long mode = begin_flush();
+    memset(grad_table, 0, (size_t)(K * O) * sizeof(float));
+    memset(grad_shared, 0, (size_t)(T / N * O) * sizeof(float));
+    memset(grad_scale, 0, (size_t)O * sizeof(float));
+    memset(grad_shift, 0, (size_t)O * sizeof(float));
+    for (long row = 0; row < T; row++) {
+        float *to = grad_table + (codes ? codes[row] : row) * O;
+        row_backward(O, RELU, activated + row * O, statistics + 2 * row, scale, grad_y + row * O, grad,
+                     grad_shared + row / N * O, grad_scale, grad_shift);
+        FOR_EACH_VECTOR(O, { add_to(to + j, load_upto(grad + j, lanes), lanes); });
+    }
+    end_flush(mode);
+    free(grad);
     return 0;
 }
