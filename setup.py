@@ -1,0 +1,29 @@
+"""Install the library dae_ros, the nodes (from nodes/, as dae_ros_nodes) and their executables."""
+from glob import glob
+
+from setuptools import find_packages, setup
+
+EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'trainer', 'world')
+
+setup(
+    name='dae_ros',
+    version='0.1.0',
+    packages=find_packages(include=['dae_ros', 'dae_ros.*']) + ['dae_ros_nodes'],
+    package_dir={'dae_ros_nodes': 'nodes'},
+    data_files=[
+        ('share/ament_index/resource_index/packages', ['resource/dae_ros']),
+        ('share/dae_ros', ['package.xml']),
+        ('share/dae_ros/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        ('share/dae_ros/launch', sorted(glob('launch/*.py'))),
+    ],
+    python_requires='>=3.10',
+    install_requires=['matplotlib', 'numpy', 'pyyaml', 'rich', 'safetensors', 'tensorboard', 'torch'],
+    zip_safe=False,
+    author='dae_ros maintainers',
+    author_email='dae_ros@example.org',
+    maintainer='dae_ros maintainers',
+    maintainer_email='dae_ros@example.org',
+    description='Trains and runs cooperative robot teams over a ROS 2 graph.',
+    license='Apache-2.0',
+    entry_points={'console_scripts': [f'{name} = dae_ros_nodes.{name}:main' for name in EXECUTABLES]},
+)
