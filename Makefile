@@ -1,0 +1,28 @@
+# `make help` lists the targets. ARGS is passed on:  make test ARGS='-k matrix -x'
+# PYTHON names the interpreter for .venv; without it, set-up takes the first suitable one it finds.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help build demo test lint lock clean
+export PYTHON
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-6s %s\n", $$1, $$2 }' Makefile
+
+build:  ## set up .venv and build both packages; does nothing when that is done
+	@scripts/setup.sh
+
+demo: build  ## train cooperative navigation over a ROS graph on this machine; ARGS goes to bringup
+	@. scripts/env.sh && exec install/dae_ros/lib/dae_ros/bringup config/demo.yaml $(ARGS)
+
+test: build  ## run every test; ARGS goes to pytest
+	@. scripts/env.sh && exec python -m pytest $(ARGS)
+
+lint: build  ## check the style with ruff
+	@.venv/bin/ruff check $(ARGS)
+
+lock: build  ## choose the versions in requirements/*.txt anew
+	@scripts/lock.sh
+
+clean:  ## remove what set-up and tests made; runs/ stays
+	@rm -rf .venv build install log .pytest_cache .hypothesis .ruff_cache
+	@find . -name __pycache__ -prune -exec rm -rf {} +
