@@ -124,12 +124,13 @@ def predictions(network, states, actions, episode_start):
 
 @pytest.mark.parametrize('agent', range(SPEC.num_agents))
 @pytest.mark.parametrize('when', [0, 3], ids=['past', 'current'])
-def test_the_reward_predicted_for_an_agent_depends_on_the_others_actions_and_not_on_its_own(agent, when):
+@pytest.mark.parametrize('worlds', [2, 40])
+def test_the_reward_predicted_for_an_agent_depends_on_the_others_actions_and_not_on_its_own(agent, when, worlds):
     network = make_reward_network(SPEC, REWARD, 1, 0)
-    states, episode_start = normal(4, 5, SPEC.state_size), torch.zeros(4, 5, dtype=torch.bool)
-    actions = torch.zeros(4, 5, SPEC.num_agents, dtype=torch.int64)
+    states, episode_start = normal(4, worlds, SPEC.state_size), torch.zeros(4, worlds, dtype=torch.bool)
+    actions = torch.zeros(4, worlds, SPEC.num_agents, dtype=torch.int64)
     before = predictions(network, states, actions, episode_start)
-    assert before.shape == (4, 5, SPEC.num_agents, SPEC.num_actions)
+    assert before.shape == (4, worlds, SPEC.num_agents, SPEC.num_actions)
     for changed in range(SPEC.num_agents):
         for action in range(1, SPEC.num_actions):
             other = actions.clone()
@@ -139,6 +140,17 @@ def test_the_reward_predicted_for_an_agent_depends_on_the_others_actions_and_not
                 assert (difference < 1e-5).all()
             else:
                 assert (difference > 1e-3).all()
+
+
+def test_the_reward_predicted_for_a_world_does_not_depend_on_how_many_worlds_there_are():
+    network = make_reward_network(SPEC, REWARD, 1, 0)
+    states, episode_start = normal(4, 60, SPEC.state_size), starts(4, 60)
+    actions = torch.randint(SPEC.num_actions, (4, 60, SPEC.num_agents), generator=torch.Generator().manual_seed(1))
+    together = predictions(network, states, actions, episode_start)
+    for first in range(0, 60, 7):
+        some = slice(first, first + 2)
+        alone = predictions(network, states[:, some], actions[:, some], episode_start[:, some])
+        torch.testing.assert_close(alone, together[:, some], rtol=1e-4, atol=1e-5)
 
 
 def test_the_reward_predicted_tells_the_agents_and_their_actions_apart():

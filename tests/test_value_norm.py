@@ -64,6 +64,12 @@ def test_targets_that_are_all_equal_are_not_divided_by_nothing():
     assert normalized.tolist() == pytest.approx([0.0, 1.0], abs=1e-6)  # no deviation below 0.1 is believed
 
 
+def test_targets_far_from_zero_are_normalised_as_finely_as_others():
+    batch = targets(1, mean=20_000.0, deviation=0.5)
+    normalized = normalizer_after([batch]).normalize(batch.double())
+    assert float(normalized.std(correction=0)) == pytest.approx(1, abs=1e-3)
+
+
 def test_values_keep_their_shape_and_type():
     normalizer = normalizer_after([targets(1)])
     for change in (normalizer.normalize, normalizer.denormalize):
