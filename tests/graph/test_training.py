@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import random
 
 import pytest
-from harness import SMALL, bringup, finish, in_process_summary, processes_naming
+from harness import SMALL, bringup, finish, oracle, processes_naming
+
+from dae_ros.report.summary import Summary
 
 MATRIX_GAME = {**SMALL, 'task': 'matrix_game', 'num_agents': 4, 'num_steps': 4, 'total_steps': 5 * 8 * 4, 'beta': 1.0}
 
@@ -15,19 +16,29 @@ MATRIX_GAME = {**SMALL, 'task': 'matrix_game', 'num_agents': 4, 'num_steps': 4, 
 def test_a_graph_run_ends_with_the_weights_of_the_in_process_run_bit_for_bit(values, domain, tmp_path):
     code, output, errors = finish(bringup(tmp_path / 'graph', values))
     assert code == 0, errors
-    on_graph = json.loads((tmp_path / 'graph' / 'summary.json').read_text())
-    oracle = in_process_summary(tmp_path / 'alone', values)
-    assert on_graph['weights_sha256'] == oracle['weights_sha256']
-    assert on_graph['evaluation_return'] == oracle['evaluation_return']
-    assert on_graph['weights_sha256'] in output
-    assert (tmp_path / 'graph' / 'policy.safetensors').read_bytes() == (tmp_path / 'alone' / 'policy.safetensors').read_bytes()
+    summary = Summary.read(tmp_path / 'graph' / 'summary.json')
+    assert (summary.weights_sha256, summary.evaluation_return) == oracle(tmp_path / 'alone', values)
+    assert summary.weights_sha256 in output
+    policies = [(tmp_path / name / 'policy.safetensors').read_bytes() for name in ('graph', 'alone')]
+    assert policies[0] == policies[1]
     assert not processes_naming(str(tmp_path))
 
 
-def test_the_same_seed_ends_with_the_same_weights_and_another_seed_with_others(domain, tmp_path):
-    digests = [in_process_summary(tmp_path / name, {**SMALL, 'seed': seed})['weights_sha256']
-               for name, seed in (('a', 1), ('b', 1), ('c', 2))]
-    assert digests[0] == digests[1] != digests[2]
+def test_bringup_in_process_is_the_same_run_and_leaves_the_same_files(tmp_path):
+    code, output, errors = finish(bringup(tmp_path / 'run', SMALL, '--in-process'))
+    assert code == 0, errors
+    summary = Summary.read(tmp_path / 'run' / 'summary.json')
+    assert (summary.weights_sha256, summary.evaluation_return) == oracle(tmp_path / 'alone', SMALL)
+    assert set(summary.yardsticks) == {'no-op', 'random', 'greedy'}
+    for name in ('settings.yaml', 'metrics.csv', 'learning_curve.png', 'episode.png', 'episode.gif', 'policy.safetensors'):
+        assert (tmp_path / 'run' / name).stat().st_size > 0
+    assert list((tmp_path / 'run' / 'tensorboard').iterdir()) and list((tmp_path / 'run' / 'checkpoints').iterdir())
+
+
+def test_the_same_seed_ends_with_the_same_weights_and_another_seed_with_others(tmp_path):
+    first, again, other = (oracle(tmp_path / name, {**SMALL, 'seed': seed}) for name, seed in (('a', 1), ('b', 1), ('c', 2)))
+    assert first == again
+    assert first[0] != other[0]
 
 
 @pytest.mark.parametrize('shuffle', range(3))
@@ -37,7 +48,7 @@ def test_nodes_find_each_other_whatever_the_order_they_are_started_in(shuffle, m
     random.Random(shuffle).shuffle(names)
     graph.start(*names)
     assert graph.wait() == 0, graph.log('trainer')
-    assert graph.summary()['weights_sha256'] == in_process_summary(tmp_path / 'alone', SMALL)['weights_sha256']
+    assert graph.result() == oracle(tmp_path / 'alone', SMALL)
 
 
 def test_two_teams_in_two_namespaces_do_not_disturb_each_other(make_graph, tmp_path):
@@ -47,8 +58,7 @@ def test_two_teams_in_two_namespaces_do_not_disturb_each_other(make_graph, tmp_p
         graph.start(*graph.names)
     for name, graph in graphs.items():
         assert graph.wait() == 0, graph.log('trainer')
-        oracle = in_process_summary(tmp_path / f'{name}_alone', runs[name])
-        assert graph.summary()['weights_sha256'] == oracle['weights_sha256']
+        assert graph.result() == oracle(tmp_path / f'{name}_alone', runs[name])
         assert 'refused' not in ''.join(graph.log(node) for node in graph.names)
 
 
