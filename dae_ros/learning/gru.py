@@ -1,8 +1,8 @@
 """A GRU over a whole sequence as one differentiable operation.
 
-Autograd over a step-by-step GRU records some twenty small operations per step; here the forward pass saves the gates and
-the backward pass is written out, with the weights' gradients as one product over all steps. The native kernels compute the
-same several times faster; this is their reference and fallback.
+Autograd over a step-by-step GRU records some twenty small operations per step; here the forward pass saves the gates
+and the backward pass is written out, with the weights' gradients as one product over all steps. The native kernels
+compute the same several times faster; this is their reference and fallback.
 """
 
 from __future__ import annotations

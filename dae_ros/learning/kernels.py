@@ -2,8 +2,8 @@
 
 `library` is chosen once, at import: the compiled kernels, or None where there is no C compiler or where the environment
 variable DAE_ROS_KERNELS is `torch`; then, and for tensors that are not float32 on the CPU, `networks` computes the
-same with torch's own operations. The two differ by rounding, so a run keeps to one of them. Calls give up Python's lock:
-threads run side by side.
+same with torch's own operations. The two differ by rounding, so a run keeps to one of them. Calls give up Python's
+lock: threads run side by side.
 """
 
 from __future__ import annotations
@@ -27,11 +27,14 @@ _SIGNATURES = {'gru_forward': (4, 9), 'gru_backward': (4, 14), 'layer_forward': 
 
 
 class Step(NamedTuple):
-    """One step of a chain: a GRU, or LayerNorm(activation(x weight^T + bias)) of which any part may be left out."""
+    """One step of a chain: a GRU, or LayerNorm(activation(x weight^T + bias)) of which any part may be left out.
 
-    kind: str                                # 'gru', or the activation: 'identity', 'relu' or 'tanh'
-    parameters: tuple[Tensor | None, ...]    # of a GRU: weight_ih, weight_hh, bias_ih, bias_hh, as in `gru.gru_sequence`;
-    #                                          otherwise weight [O, I] and bias [O], scale and shift [O] of the LayerNorm
+    Parameters of a GRU: weight_ih, weight_hh, bias_ih, bias_hh, as in `gru.gru_sequence`; otherwise weight [O, I] and
+    bias [O], scale and shift [O] of the LayerNorm.
+    """
+
+    kind: str  # 'gru', or the activation: 'identity', 'relu' or 'tanh'
+    parameters: tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]
 
 
 def _load() -> ctypes.CDLL | None:
@@ -90,14 +93,15 @@ def chain(steps: Sequence[Step], x: Tensor, initial: Tensor | None = None,
 def looked_up(table: Tensor, codes: Tensor | None, shared: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
     """LayerNorm(relu(table[codes] + shared)), without writing down what is normalised.
 
-    table: [K, O]. codes: [M, N] int64 in 0 .. K - 1, or None: one row of the table after another, K = M N. shared: [M, O].
-    scale and shift [O]: of the LayerNorm. Returns [M, N, O].
+    table: [K, O]. codes: [M, N] int64 in 0 .. K - 1, or None: one row of the table after another, K = M N.
+    shared: [M, O]. scale and shift [O]: of the LayerNorm. Returns [M, N, O].
     """
     if _tracked(table, shared, scale, shift):
         return _LookedUp.apply(table, codes, shared, scale, shift)
     table, codes, shared, scale, shift = _contiguous((table, codes, shared, scale, shift))
     y = _looked_up_output(table, codes, shared)
-    _call('looked_up_forward', (y[..., 0].numel(), y.shape[1], y.shape[2]), codes, table, shared, scale, shift, y, None, y)
+    M, N, O = y.shape
+    _call('looked_up_forward', (M * N, N, O), codes, table, shared, scale, shift, y, None, y)
     return y
 
 
@@ -145,13 +149,12 @@ class _Chain(torch.autograd.Function):
                 continue
             grad, = _contiguous((grad,))
             of_own = [None if part is None else torch.empty_like(part) for part in own]
-            # A layer without a product overwrites its input's gradient anyway, so there it is always computed.
-            of_inputs = torch.empty_like(inputs) if index or ctx.needs_input_grad[1] or own[0] is None else None
+            of_inputs = torch.empty_like(inputs) if index or ctx.needs_input_grad[1] else None
             I, O = inputs.shape[-1], grad.shape[-1]
             if kind == 'gru':
                 grad_initial = torch.empty_like(initial) if ctx.needs_input_grad[2] else None
-                _call('gru_backward', (*inputs.shape[:2], I, O), inputs, initial, start, own[0], own[1], first, second, grad,
-                      of_inputs, grad_initial, *of_own)
+                _call('gru_backward', (*inputs.shape[:2], I, O), inputs, initial, start, own[0], own[1], first, second,
+                      grad, of_inputs, grad_initial, *of_own)
             else:
                 _call('layer_backward', (inputs.numel() // I, I, O, _ACTIVATIONS[kind]), inputs, own[0], own[2], first,
                       second, grad, of_inputs, *of_own)
@@ -167,8 +170,8 @@ class _LookedUp(torch.autograd.Function):
         table, codes, shared, scale, shift = _contiguous((table, codes, shared, scale, shift))
         y = _looked_up_output(table, codes, shared)
         activated, statistics = torch.empty_like(y), y.new_empty(*y.shape[:2], 2)
-        _call('looked_up_forward', (y[..., 0].numel(), y.shape[1], y.shape[2]), codes, table, shared, scale, shift, activated,
-              statistics, y)
+        M, N, O = y.shape
+        _call('looked_up_forward', (M * N, N, O), codes, table, shared, scale, shift, activated, statistics, y)
         ctx.table_rows = len(table)
         ctx.save_for_backward(codes, scale, activated, statistics)
         return y
@@ -180,8 +183,8 @@ class _LookedUp(torch.autograd.Function):
         M, N, O = grad.shape
         grad_table, grad_shared = grad.new_empty(ctx.table_rows, O), grad.new_empty(M, O)
         grad_scale, grad_shift = torch.empty_like(scale), torch.empty_like(scale)
-        _call('looked_up_backward', (M * N, N, O, ctx.table_rows), codes, scale, activated, statistics, grad.contiguous(),
-              grad_table, grad_shared, grad_scale, grad_shift)
+        _call('looked_up_backward', (M * N, N, O, ctx.table_rows), codes, scale, activated, statistics,
+              grad.contiguous(), grad_table, grad_shared, grad_scale, grad_shift)
         return grad_table, None, grad_shared, grad_scale, grad_shift
 
 

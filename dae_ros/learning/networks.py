@@ -23,7 +23,7 @@ from dae_ros.types import WorldSpec
 
 _ACTIVATIONS = {'identity': lambda x: x, 'relu': torch.relu, 'tanh': torch.tanh}
 _GAINS = {'relu': math.sqrt(2), 'tanh': 5 / 3}
-_LOOK_UP_BELOW = 0.5  # a table of everything the others can do is used if it is at most this large, relative to the batch
+_LOOK_UP_BELOW = 0.5  # largest table of everything the others can do, relative to the batch
 
 
 def layer(linear: nn.Linear | None = None, activation: str = 'identity', norm: nn.LayerNorm | None = None) -> Step:
@@ -84,8 +84,10 @@ class RecurrentNetwork(nn.Module):
 
 @functools.lru_cache(maxsize=8)
 def _joint_actions_of_others(num_agents: int, num_actions: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Everything each agent's others can do, as one-hot blocks [N A^(N-1), N A] with the agent's own block zero. The row of
-    agent i at joint action a is sum_j a_j place[i, j] + first[i]; place [N, N], first [N]."""
+    """Everything each agent's others can do, as one-hot blocks [N A^(N-1), N A] with the agent's own block zero.
+
+    Agent i's row at the joint action a is sum_j a_j place[i, j] + first[i]; place [N, N], first [N].
+    """
     N, A = num_agents, num_actions
     weights = A ** torch.arange(N - 2, -1, -1, device=device)
     digits = torch.arange(A ** (N - 1), device=device).unsqueeze(1) // weights % A
@@ -125,12 +127,13 @@ class PerAgentRewardNetwork(nn.Module):
         others, codes = self._others(actions.flatten(0, 1))
         joint = self._joint(run([layer(self.joint_action)], others)[0], codes, seen.flatten(0, 1))
         steps = [self.gru.step(), layer(norm=self.gru_norm), layer(self.head)]
-        predicted, states = run(steps, joint.view(L, C * N, -1), initial, episode_start.repeat_interleave(N, dim=1))
-        return predicted.view(L, C, N, -1), states
+        starts = episode_start.repeat_interleave(N, dim=1)
+        predicted, states = run(steps, joint.view(L, C * N, joint.shape[-1]), initial, starts)
+        return predicted.view(L, C, N, self.num_actions), states
 
     def _others(self, actions: Tensor) -> tuple[Tensor, Tensor | None]:
-        """First layer over the others' actions: rows [K, H], and which of them each agent has [M, N] for actions [M, N];
-        None if every agent has a row of its own, in order (K = M N)."""
+        """First layer over the others' actions [M, N]: rows [K, H], and which of them each agent has [M, N]; None if
+        each has a row of its own, in order (K = M N)."""
         N, A = self.num_agents, self.num_actions
         if N * A ** (N - 1) <= _LOOK_UP_BELOW * actions.numel():
             hot, place, first = _joint_actions_of_others(N, A, actions.device)
@@ -145,7 +148,8 @@ class PerAgentRewardNetwork(nn.Module):
         norm = self.joint_norm
         if kernels.usable(table, seen, norm.weight):
             return kernels.looked_up(table, codes, seen, norm.weight, norm.bias)
-        chosen = table.view(len(seen), self.num_agents, -1) if codes is None else functional.embedding(codes, table)
+        own = codes is None
+        chosen = table.view(len(seen), self.num_agents, table.shape[-1]) if own else functional.embedding(codes, table)
         return norm(torch.relu(chosen + seen.unsqueeze(1)))
 
 
@@ -162,7 +166,8 @@ def make_critic(spec: WorldSpec, settings: LearnerSettings, seed: int) -> Recurr
     return _initialise(critic, _GAINS[settings.activation], 1.0, seed, 'critic')
 
 
-def make_reward_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int, member: int) -> PerAgentRewardNetwork:
+def make_reward_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int,
+                        member: int) -> PerAgentRewardNetwork:
     """Member `member` of the reward ensemble (algorithm 1, line 14)."""
     network = PerAgentRewardNetwork(spec, settings.hidden_size)
     return _initialise(network, _GAINS['relu'], 1.0, seed, f'reward_network.{member}')

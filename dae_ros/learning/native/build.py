@@ -1,7 +1,7 @@
 """Compiles kernels.c for this processor, once per user and machine.
 
-The library is built where it is first needed, so every way of installing the package gives the same fast learner, and the
-instructions are always those of the processor that runs them.
+The library is built where it is first needed, so every way of installing the package gives the same fast learner, and
+the instructions are always those of the processor that runs them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Iterator
 
 SOURCE = Path(__file__).with_name('kernels.c')
-_FLAGS = ('-std=gnu11', '-O3', '-ffp-contract=fast', '-fno-math-errno', '-fno-trapping-math', '-Wno-psabi', '-fPIC', '-shared')
+_FLAGS = ('-std=gnu11', '-O3', '-ffp-contract=fast', '-fno-math-errno', '-fno-trapping-math', '-Wno-psabi', '-fPIC',
+          '-shared')
 
 
 class BuildError(Exception):
@@ -44,7 +45,7 @@ def build(target: Path) -> None:
 
 @contextlib.contextmanager
 def library_path() -> Iterator[Path]:
-    """Path of the compiled library while the block runs; compiled now if this user has none for this processor and source.
+    """Path of the compiled library while the block runs; compiled now if this user has none for processor and source.
 
     It is kept in $XDG_CACHE_HOME/dae_ros (~/.cache/dae_ros), or, if nothing can be written there, in a folder that is
     removed again. Processes that start at once may each compile; all end with a whole file. Raises BuildError.
@@ -78,5 +79,5 @@ def _key() -> str:
     with contextlib.suppress(OSError):
         lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
         processor |= {line for line in lines if line.startswith(('flags', 'Features', 'model name', 'CPU part'))}
-    parts = [SOURCE.read_text(encoding='utf-8'), *_FLAGS, os.environ.get('CC', ''), platform.system(), *sorted(processor)]
+    parts = [SOURCE.read_text(encoding='utf-8'), *_FLAGS, os.environ.get('CC', ''), *sorted(processor)]
     return hashlib.sha256('\0'.join(parts).encode()).hexdigest()[:16]

@@ -37,10 +37,15 @@ INLINE vec all(float x) { return (vec){x, x, x, x, x, x, x, x}; }
 INLINE vec load_upto(const float *p, long n) {
     if (n >= LANES)
         return load(p);
+#if defined(__AVX2__)
+    const __m256i lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+    return _mm256_maskload_ps(p, _mm256_cmpgt_epi32(_mm256_set1_epi32((int)n), lane));
+#else
     vec v = all(0);
     for (long i = 0; i < n; i++)
         v[i] = p[i];
     return v;
+#endif
 }
 
 INLINE void store_upto(float *p, vec v, long n) {
@@ -182,9 +187,12 @@ static int begin_arena(Arena *arena) {
 INLINE void tile(const int rows, long K, const float *a, long row_step, long k_step, const float *b, float *c, long ldc,
                  int accumulate) {
     vec sum[ROWS][2];
-    for (int r = 0; r < rows; r++)
+    for (int r = 0; r < rows; r++) {
+        __builtin_prefetch(c + r * ldc, 1);
+        __builtin_prefetch(c + r * ldc + COLUMNS - 1, 1);
         for (int half = 0; half < 2; half++)
             sum[r][half] = all(0);
+    }
 #pragma GCC unroll 4
     for (long k = 0; k < K; k++) {
         vec left = *(const vec *)b, right = *(const vec *)(b + LANES);
@@ -198,7 +206,8 @@ INLINE void tile(const int rows, long K, const float *a, long row_step, long k_s
     }
     for (int r = 0; r < rows; r++)
         for (int half = 0; half < 2; half++)
-            store(c + r * ldc + half * LANES, accumulate ? load(c + r * ldc + half * LANES) + sum[r][half] : sum[r][half]);
+            store(c + r * ldc + half * LANES, accumulate ? load(c + r * ldc + half * LANES) + sum[r][half]
+                                                       : sum[r][half]);
 }
 
 #define FOR_EACH_ROW_COUNT(rows, call)                                                                                 \
@@ -225,7 +234,8 @@ static void packed_tile(long rows, long K, const float *a, const float *b, float
 }
 
 /* c[M, COLUMNS] = (or +=) a[M, K] panel[K, COLUMNS]. */
-static void times_panel(long M, long K, const float *a, long lda, const float *panel, float *c, long ldc, int accumulate) {
+static void times_panel(long M, long K, const float *a, long lda, const float *panel, float *c, long ldc,
+                        int accumulate) {
     for (long k = 0; k < K; k += DEPTH)
         for (long row = 0; row < M; row += ROWS)
             row_major_tile(min(ROWS, M - row), min(DEPTH, K - k), a + row * lda + k, lda, panel + k * COLUMNS,
@@ -263,10 +273,18 @@ static long packed_size(long K, long N) { return K * round_up(N, COLUMNS); }
 static void pack(long K, long N, const float *matrix, long ld, float *panels, long capacity) {
     for (long column = 0; column < N; column += COLUMNS, panels += capacity * COLUMNS) {
         const float *from = matrix + column;
-        long columns = N - column;
-        for (long k = 0; k < K; k++, from += ld)
-            for (long half = 0; half < COLUMNS; half += LANES)
-                *(vec *)(panels + k * COLUMNS + half) = columns > half ? load_upto(from + half, columns - half) : all(0);
+        const long columns = N - column;
+        float *to = panels;
+        if (columns >= COLUMNS)
+            for (long k = 0; k < K; k++, from += ld, to += COLUMNS) {
+                store(to, load(from));
+                store(to + LANES, load(from + LANES));
+            }
+        else
+            for (long k = 0; k < K; k++, from += ld, to += COLUMNS) {
+                store(to, load_upto(from, columns));
+                store(to + LANES, columns > LANES ? load_upto(from + LANES, columns - LANES) : all(0));
+            }
     }
 }
 
@@ -350,11 +368,13 @@ static GruForward gru_forward_scratch(Arena *arena, long I, long H) {
 static void gates_panel(long rows, long columns, long H, float *products, const float *before, const float *bias_ih,
                         const float *bias_hh, float *states, float *gates) {
     float *const update_products = products + BLOCK * COLUMNS;
-    const float *const from_inputs = products + 2 * BLOCK * COLUMNS, *const from_states = products + 3 * BLOCK * COLUMNS;
+    const float *const from_inputs = products + 2 * BLOCK * COLUMNS;
+    const float *const from_states = products + 3 * BLOCK * COLUMNS;
     FOR_EACH_VECTOR(columns, {
         const vec reset_bias = load_upto(bias_ih + j, lanes) + load_upto(bias_hh + j, lanes);
         const vec update_bias = load_upto(bias_ih + H + j, lanes) + load_upto(bias_hh + H + j, lanes);
-        const vec input_bias = load_upto(bias_ih + 2 * H + j, lanes), state_bias = load_upto(bias_hh + 2 * H + j, lanes);
+        const vec input_bias = load_upto(bias_ih + 2 * H + j, lanes);
+        const vec state_bias = load_upto(bias_hh + 2 * H + j, lanes);
         for (long at = j; at < rows * COLUMNS; at += COLUMNS) {
             store(products + at, sigmoid_of(load(products + at) + reset_bias));
             store(update_products + at, sigmoid_of(load(update_products + at) + update_bias));
@@ -381,8 +401,8 @@ static void gates_panel(long rows, long columns, long H, float *products, const 
  * inputs [L, R, I], initial [R, H], start [L, R], weight_ih [3 H, I], weight_hh [3 H, H], bias_ih, bias_hh [3 H] in the
  * order reset, update, candidate. Returns 0, or 1 if there is no memory. */
 int gru_forward(long L, long R, long I, long H, const float *inputs, const float *initial, const uint8_t *start,
-                const float *weight_ih, const float *weight_hh, const float *bias_ih, const float *bias_hh, float *states,
-                float *gates) {
+                const float *weight_ih, const float *weight_hh, const float *bias_ih, const float *bias_hh,
+                float *states, float *gates) {
     Arena arena = {0};
     gru_forward_scratch(&arena, I, H);
     if (!begin_arena(&arena))
@@ -543,9 +563,13 @@ INLINE vec slope(vec activated, int activation) {
                                 : all(1);
 }
 
-/* One row: from += bias, activated, into `activated` (unless NULL); normalised into y (unless scale is NULL). */
-INLINE void finish_row(long O, const int activation, const float *from, const float *bias, const float *scale,
-                       const float *shift, float *activated, float *statistics, float *y) {
+/* LayerNorm of a block of rows takes three passes over all of them, not row by row: a row's sums are chains of
+ * dependent additions, and the processor overlaps those of several rows. A row's statistics are its mean and the
+ * inverse of its deviation. */
+
+/* One row plus bias (unless NULL), activated; into `to`, unless NULL. */
+INLINE void activate_row(long O, const int activation, const float *from, const float *bias, float *to,
+                         float *statistics) {
     vec sum = all(0);
     FOR_EACH_VECTOR(O, {
         vec x = load_upto(from + j, lanes);
@@ -553,36 +577,47 @@ INLINE void finish_row(long O, const int activation, const float *from, const fl
             x += load_upto(bias + j, lanes);
         x = activate(x, activation);
         sum += x;
-        if (activated)
-            store_upto(activated + j, x, lanes);
+        if (to)
+            store_upto(to + j, x, lanes);
     });
-    if (!scale)
-        return;
-    if (activated)
-        from = activated;
-    const float mean = sum_of(sum) / (float)O;
-    vec squares = all(0);
-    FOR_EACH_VECTOR(O, {
-        vec centred = load_upto(from + j, lanes) - all(mean);
-        if ((long)lanes < LANES)
-            centred = load_upto((const float *)&centred, lanes); /* what is beyond the row must not count */
-        squares += centred * centred;
-    });
-    const float inverse_deviation = 1 / __builtin_sqrtf(sum_of(squares) / (float)O + 1e-5f);
-    FOR_EACH_VECTOR(O, {
-        vec normal = (load_upto(from + j, lanes) - all(mean)) * all(inverse_deviation);
-        store_upto(y + j, normal * load_upto(scale + j, lanes) + load_upto(shift + j, lanes), lanes);
-    });
-    if (statistics) {
-        statistics[0] = mean;
-        statistics[1] = inverse_deviation;
+    statistics[0] = sum_of(sum) / (float)O;
+}
+
+static void normalise(long rows, long O, const float *from, const float *scale, const float *shift, float *statistics,
+                      float *y) {
+    for (long row = 0; row < rows; row++) {
+        const float *x = from + row * O;
+        const vec mean = all(statistics[2 * row]);
+        vec squares = all(0);
+        FOR_EACH_VECTOR(O, {
+            vec centred = load_upto(x + j, lanes) - mean;
+            if ((long)lanes < LANES)
+                centred = load_upto((const float *)&centred, lanes); /* what is beyond the row must not count */
+            squares += centred * centred;
+        });
+        statistics[2 * row + 1] = 1 / __builtin_sqrtf(sum_of(squares) / (float)O + 1e-5f);
+    }
+    for (long row = 0; row < rows; row++) {
+        const vec mean = all(statistics[2 * row]), inverse_deviation = all(statistics[2 * row + 1]);
+        FOR_EACH_VECTOR(O, {
+            vec normal = (load_upto(from + row * O + j, lanes) - mean) * inverse_deviation;
+            store_upto(y + row * O + j, normal * load_upto(scale + j, lanes) + load_upto(shift + j, lanes), lanes);
+        });
     }
 }
 
+#define FOR_ACTIVATION(activation, call)                                                                               \
+    if (activation == RELU)                                                                                            \
+        call(RELU);                                                                                                    \
+    else if (activation == TANH)                                                                                       \
+        call(TANH);                                                                                                    \
+    else                                                                                                               \
+        call(IDENTITY);
+
 /* y[T, O] = LayerNorm(activation(x weight^T + bias)).
  * x [T, I]. weight [O, I] or NULL: x itself, I = O. bias [O] or NULL. scale, shift [O], or both NULL: no LayerNorm.
- * For layer_backward: activated [T, O] and statistics [T, 2], or NULL; `activated` is not written, and need not be there,
- * where it would equal x or y. Returns 0, or 1 if there is no memory. */
+ * For layer_backward: activated [T, O] and statistics [T, 2], or NULL; `activated` is not written, and need not be
+ * there, where it would equal x or y. Returns 0, or 1 if there is no memory. */
 int layer_forward(long T, long I, long O, long activation, const float *x, const float *weight, const float *bias,
                   const float *scale, const float *shift, float *activated, float *statistics, float *y) {
     Arena arena = {0};
@@ -593,51 +628,59 @@ int layer_forward(long T, long I, long O, long activation, const float *x, const
     unsigned long mode = begin_flush();
     if (weight)
         pack_transposed(I, O, weight, packed);
-    const int as_it_is = !weight && activation == IDENTITY;
+    const int as_it_is = !weight && activation == IDENTITY && scale;
+    float own_statistics[2 * BLOCK];
     for (long first = 0; first < T; first += BLOCK) {
         const long rows = min(BLOCK, T - first);
-        float *middle = activated && scale && !as_it_is ? activated : y;
+        float *middle = (activated && scale && !as_it_is ? activated : y) + first * O;
+        float *pairs = statistics ? statistics + 2 * first : own_statistics;
         if (weight)
-            times_packed(rows, O, I, x + first * I, I, packed, middle + first * O, O, 0);
-        for (long row = first; row < first + rows; row++) {
-            const float *from = (weight ? middle : x) + row * O;
-            float *to = as_it_is && scale ? NULL : middle + row * O, *pair = statistics ? statistics + 2 * row : NULL;
-            if (activation == RELU)
-                finish_row(O, RELU, from, bias, scale, shift, to, pair, y + row * O);
-            else if (activation == TANH)
-                finish_row(O, TANH, from, bias, scale, shift, to, pair, y + row * O);
-            else
-                finish_row(O, IDENTITY, from, bias, scale, shift, to, pair, y + row * O);
+            times_packed(rows, O, I, x + first * I, I, packed, middle, O, 0);
+        const float *from = weight ? middle : x + first * O;
+        for (long row = 0; row < rows; row++) {
+#define CALL(kind) activate_row(O, kind, from + row * O, bias, as_it_is ? NULL : middle + row * O, pairs + 2 * row)
+            FOR_ACTIVATION(activation, CALL)
+#undef CALL
         }
+        if (scale)
+            normalise(rows, O, as_it_is ? from : middle, scale, shift, pairs, y + first * O);
     }
     end_flush(mode);
     free(arena.base);
     return 0;
 }
 
-/* One row's gradient before the activation; adds to those of bias, scale and shift. */
-INLINE void row_backward(long O, const int activation, const float *activated, const float *statistics, const float *scale,
-                         const float *grad_y, float *grad, float *grad_bias, float *grad_scale, float *grad_shift) {
-    float mean = 0, inverse_deviation = 1, mean_grad = 0, mean_product = 0;
-    if (scale) {
-        mean = statistics[0], inverse_deviation = statistics[1];
+/* What the LayerNorms of a block of rows add to the gradients of scale and shift, and for each row the means over the
+ * normalised units of their gradients and of these times the units. */
+static void normalise_backward(long rows, long O, const float *activated, const float *statistics, const float *scale,
+                               const float *grad_y, float *grad_scale, float *grad_shift, float *means) {
+    for (long row = 0; row < rows; row++, activated += O, grad_y += O) {
+        const vec mean = all(statistics[2 * row]), inverse_deviation = all(statistics[2 * row + 1]);
         vec sum = all(0), sum_product = all(0);
         FOR_EACH_VECTOR(O, {
-            vec incoming = load_upto(grad_y + j, lanes);
-            vec product = incoming * ((load_upto(activated + j, lanes) - all(mean)) * all(inverse_deviation));
-            vec factor = load_upto(scale + j, lanes);
+            vec incoming = load_upto(grad_y + j, lanes), factor = load_upto(scale + j, lanes);
+            vec product = incoming * ((load_upto(activated + j, lanes) - mean) * inverse_deviation);
             sum += incoming * factor;
             sum_product += product * factor;
             add_to(grad_scale + j, product, lanes);
             add_to(grad_shift + j, incoming, lanes);
         });
-        mean_grad = sum_of(sum) / (float)O, mean_product = sum_of(sum_product) / (float)O;
+        means[2 * row] = sum_of(sum) / (float)O;
+        means[2 * row + 1] = sum_of(sum_product) / (float)O;
     }
+}
+
+/* One row's gradient before the activation, added to that of the bias unless this is NULL. No LayerNorm if scale is
+ * NULL; then statistics and means are not read. */
+INLINE void row_backward(long O, const int activation, const float *activated, const float *statistics,
+                         const float *means, const float *scale, const float *grad_y, float *grad, float *grad_bias) {
+    const vec mean = all(scale ? statistics[0] : 0), inverse_deviation = all(scale ? statistics[1] : 1);
+    const vec mean_grad = all(scale ? means[0] : 0), mean_product = all(scale ? means[1] : 0);
     FOR_EACH_VECTOR(O, {
         vec g = load_upto(grad_y + j, lanes), a = load_upto(activated + j, lanes);
         if (scale) {
-            vec normal = (a - all(mean)) * all(inverse_deviation);
-            g = (g * load_upto(scale + j, lanes) - all(mean_grad) - normal * all(mean_product)) * all(inverse_deviation);
+            vec normal = (a - mean) * inverse_deviation;
+            g = (g * load_upto(scale + j, lanes) - mean_grad - normal * mean_product) * inverse_deviation;
         }
         g *= slope(a, activation);
         store_upto(grad + j, g, lanes);
@@ -661,8 +704,8 @@ static LayerBackward layer_backward_scratch(Arena *arena, long I, long O, int li
     return s;
 }
 
-/* Gradients of what layer_forward computed, from that of y. Where it did not write `activated`, give x or y here. Those of
- * a part that is not there are NULL; grad_x may be NULL if there is a weight. Returns 0, or 1 if there is no memory. */
+/* Gradients of what layer_forward computed, from that of y. Where it did not write `activated`, give x or y here. Those
+ * of a part that is not there are NULL; grad_x may be NULL if nobody needs it. Returns 0, or 1 without memory. */
 int layer_backward(long T, long I, long O, long activation, const float *x, const float *weight, const float *scale,
                    const float *activated, const float *statistics, const float *grad_y, float *grad_x,
                    float *grad_weight, float *grad_bias, float *grad_scale, float *grad_shift) {
@@ -683,22 +726,21 @@ int layer_backward(long T, long I, long O, long activation, const float *x, cons
         memset(grad_scale, 0, (size_t)O * sizeof(float));
         memset(grad_shift, 0, (size_t)O * sizeof(float));
     }
+    float means[2 * BLOCK];
     long filled = 0;
     for (long first = 0; first < T; first += BLOCK) {
         const long rows = min(BLOCK, T - first);
-        float *grad = weight ? s.grad : grad_x + first * O;
-        for (long row = 0; row < rows; row++) {
-            const long at = first + row;
-            const float *pair = scale ? statistics + 2 * at : NULL;
-            if (activation == RELU)
-                row_backward(O, RELU, activated + at * O, pair, scale, grad_y + at * O, grad + row * O, grad_bias,
-                             grad_scale, grad_shift);
-            else if (activation == TANH)
-                row_backward(O, TANH, activated + at * O, pair, scale, grad_y + at * O, grad + row * O, grad_bias,
-                             grad_scale, grad_shift);
-            else
-                row_backward(O, IDENTITY, activated + at * O, pair, scale, grad_y + at * O, grad + row * O, grad_bias,
-                             grad_scale, grad_shift);
+        const float *pairs = scale ? statistics + 2 * first : NULL;
+        const float *from = activated + first * O, *incoming = grad_y + first * O;
+        float *grad = weight ? s.grad : grad_x ? grad_x + first * O : NULL;
+        if (scale)
+            normalise_backward(rows, O, from, pairs, scale, incoming, grad_scale, grad_shift, means);
+        for (long row = 0; row < rows && grad; row++) {
+#define CALL(kind)                                                                                                     \
+    row_backward(O, kind, from + row * O, pairs + 2 * row, means + 2 * row, scale, incoming + row * O,                 \
+                 grad + row * O, grad_bias)
+            FOR_ACTIVATION(activation, CALL)
+#undef CALL
         }
         if (!weight)
             continue;
@@ -718,14 +760,20 @@ int layer_backward(long T, long I, long O, long activation, const float *x, cons
 }
 
 /* y[T, O] = LayerNorm(relu(table[code] + shared[row / N])), row by row.
- * table [K, O]. codes [T] in 0 .. K - 1, or NULL: code = row. shared [T / N, O]. scale, shift [O]. For
- * looked_up_backward: activated [T, O] and statistics [T, 2]; statistics may be NULL, activated may be y. */
+ * table [K, O]. codes [T] in 0 .. K - 1, or NULL: code = row. shared [T / N, O]. scale, shift [O]. activated [T, O],
+ * which may be y, and statistics [T, 2] or NULL are for looked_up_backward. Returns 0. */
 int looked_up_forward(long T, long N, long O, const int64_t *codes, const float *table, const float *shared,
                       const float *scale, const float *shift, float *activated, float *statistics, float *y) {
     unsigned long mode = begin_flush();
-    for (long row = 0; row < T; row++)
-        finish_row(O, RELU, table + (codes ? codes[row] : row) * O, shared + row / N * O, scale, shift, activated + row * O,
-                   statistics ? statistics + 2 * row : NULL, y + row * O);
+    float own_statistics[2 * BLOCK];
+    for (long first = 0; first < T; first += BLOCK) {
+        const long end = min(first + BLOCK, T);
+        float *pairs = statistics ? statistics + 2 * first : own_statistics;
+        for (long row = first; row < end; row++)
+            activate_row(O, RELU, table + (codes ? codes[row] : row) * O, shared + row / N * O, activated + row * O,
+                         pairs + 2 * (row - first));
+        normalise(end - first, O, activated + first * O, scale, shift, pairs, y + first * O);
+    }
     end_flush(mode);
     return 0;
 }
@@ -742,11 +790,17 @@ int looked_up_backward(long T, long N, long O, long K, const int64_t *codes, con
     memset(grad_shared, 0, (size_t)(T / N * O) * sizeof(float));
     memset(grad_scale, 0, (size_t)O * sizeof(float));
     memset(grad_shift, 0, (size_t)O * sizeof(float));
-    for (long row = 0; row < T; row++) {
-        float *to = grad_table + (codes ? codes[row] : row) * O;
-        row_backward(O, RELU, activated + row * O, statistics + 2 * row, scale, grad_y + row * O, grad,
-                     grad_shared + row / N * O, grad_scale, grad_shift);
-        FOR_EACH_VECTOR(O, { add_to(to + j, load_upto(grad + j, lanes), lanes); });
+    float means[2 * BLOCK];
+    for (long first = 0; first < T; first += BLOCK) {
+        const long end = min(first + BLOCK, T);
+        normalise_backward(end - first, O, activated + first * O, statistics + 2 * first, scale, grad_y + first * O,
+                           grad_scale, grad_shift, means);
+        for (long row = first; row < end; row++) {
+            float *to = grad_table + (codes ? codes[row] : row) * O;
+            row_backward(O, RELU, activated + row * O, statistics + 2 * row, means + 2 * (row - first), scale,
+                         grad_y + row * O, grad, grad_shared + row / N * O);
+            FOR_EACH_VECTOR(O, { add_to(to + j, load_upto(grad + j, lanes), lanes); });
+        }
     }
     end_flush(mode);
     free(grad);
