@@ -10,6 +10,7 @@ setup(
     version='0.1.0',
     packages=find_packages(include=['dae_ros', 'dae_ros.*']) + ['dae_ros_nodes'],
     package_dir={'dae_ros_nodes': 'nodes'},
+    package_data={'dae_ros.learning.native': ['*.c']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/dae_ros']),
         ('share/dae_ros', ['package.xml']),
@@ -17,7 +18,7 @@ setup(
         ('share/dae_ros/launch', sorted(glob('launch/*.py'))),
     ],
     python_requires='>=3.10',
-    install_requires=['matplotlib', 'numpy', 'pyyaml', 'rich', 'safetensors', 'tensorboard', 'torch'],
+    install_requires=['matplotlib', 'numpy', 'pillow', 'pyyaml', 'rich', 'safetensors', 'tensorboard', 'torch'],
     zip_safe=False,
     author='dae_ros maintainers',
     author_email='dae_ros@example.org',
