@@ -63,6 +63,9 @@ trap stop EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 
+# Where the machine has a list of whom it trusts, uv goes by it, as pip does: it may hold a company's proxy.
+[ ! -e /etc/ssl/certs/ca-certificates.crt ] || export UV_SYSTEM_CERTS="${UV_SYSTEM_CERTS:-true}"
+
 pip() { "$venv/bin/python" -m pip --disable-pip-version-check -qq "$@"; }
 uv() { "$venv/bin/uv" "$@" --quiet --python "$venv/bin/python"; }
 
@@ -105,7 +108,7 @@ install_torch() {
   pip install --no-compile -c requirements/python.txt "$pin"
 }
 
-# Import once what the nodes import, to leave its byte code.
+# Import once what the nodes import, to leave its byte code, and dae_ros, to have its kernels compiled.
 warm_up() {
   "$venv/bin/python" - <<'END'
 import matplotlib.pyplot, rich.progress, safetensors.torch, torch, torch.utils.tensorboard, yaml
@@ -115,6 +118,8 @@ weight.sum().backward()
 torch.optim.Adam([weight]).step()
 END
   [ "$ros" != wheels ] || "$venv/bin/python" -c 'import diagnostic_msgs.msg, rclpy.node, std_srvs.srv'
+  # A mistake in dae_ros is for its tests to show, not for set-up.
+  "$venv/bin/python" -c 'import dae_ros.training' || true
 }
 
 build() {
