@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-SHARD_ROWS = 256  # rows of a recurrent step that fill the arithmetic units and still leave the shard in the cache
+SHARD_ROWS = 496  # most rows of a recurrent step in a shard: few shards, as starting one costs a millisecond
 
 
 def to_chunks(sequences: Tensor, length: int) -> Tensor:
@@ -34,8 +34,8 @@ def first_states(states: Tensor, length: int) -> Tensor:
 
 
 def shard_bounds(columns: int, rows_per_column: int) -> list[tuple[int, int]]:
-    """Splits `columns` chunks or worlds of `rows_per_column` rows each into near-equal runs of about SHARD_ROWS rows."""
-    shards = max(1, round(columns * rows_per_column / SHARD_ROWS))
-    shards = min(shards, columns)
+    """Splits `columns` chunks or worlds of `rows_per_column` rows each into near-equal runs of at most SHARD_ROWS rows,
+    or of a single column that is longer."""
+    shards = max(1, -(-columns // max(1, SHARD_ROWS // rows_per_column)))
     edges = [round(index * columns / shards) for index in range(shards + 1)]
     return list(zip(edges, edges[1:]))
