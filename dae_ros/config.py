@@ -12,6 +12,7 @@ import dataclasses
 import difflib
 import hashlib
 import json
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Iterator, Mapping, get_type_hints
@@ -221,7 +222,7 @@ def parse_override(text: str) -> tuple[str, Any]:
     name, separator, value = text.partition(':=')
     if not separator or not name:
         raise SettingsError(f'expected name:=value, not {text!r}')
-    return name, yaml.safe_load(value)
+    return name, _read_yaml(value, f'the value in {text!r}')
 
 
 def load_task_file(path: str | Path) -> dict[str, Any]:
@@ -231,11 +232,12 @@ def load_task_file(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+        text = path.read_text(encoding='utf-8')
     except OSError as error:
         raise SettingsError(f'cannot read the task file {path}: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise SettingsError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
+    except UnicodeDecodeError as error:
+        raise SettingsError(f'{path} is not a UTF-8 text: {error.reason}') from error
+    content = _read_yaml(text, str(path))
     try:
         (node, body), = content.items()
         (key, parameters), = body.items()
@@ -243,7 +245,26 @@ def load_task_file(path: str | Path) -> dict[str, Any]:
         raise SettingsError(f'{path} must have the one key /**: and under it ros__parameters:') from error
     if node != '/**' or key != 'ros__parameters' or not isinstance(parameters, dict):
         raise SettingsError(f'{path} must have the one key /**: and under it ros__parameters:')
-    return dict(_flat_items(parameters))
+    try:
+        return dict(_flat_items(parameters))
+    except RecursionError as error:
+        raise SettingsError(f'the parameters in {path} contain themselves') from error
+
+
+class _YamlLoader(yaml.SafeLoader):
+    """YAML 1.1 as PyYAML reads it, and numbers such as 7e-4, which ROS reads as numbers and PyYAML as texts."""
+
+
+_YamlLoader.add_implicit_resolver('tag:yaml.org,2002:float', re.compile(r'[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$'),
+                                  list('-+.0123456789'))
+
+
+def _read_yaml(text: str, origin: str) -> Any:
+    """What `text` says. Raises SettingsError, also for the errors of values that PyYAML lets through."""
+    try:
+        return yaml.load(text, _YamlLoader)
+    except (yaml.YAMLError, ValueError, LookupError, RecursionError) as error:
+        raise SettingsError(f'{origin} is not YAML: {" ".join(str(error).split())}') from error
 
 
 def _flat_items(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:

@@ -163,6 +163,15 @@ def test_a_checkpoint_whose_tensors_lost_a_bit_is_refused():
             assert reason_for(bytes(damaged), codec.decode_checkpoint) == 'corrupt'
 
 
+def test_a_checkpoint_whose_facts_changed_is_refused():
+    header, body = header_and_body(encoded_checkpoint())
+    for old, new in (('"updates": 10', '"updates": 30'), ('"updates"', '"updated"'), (', "settings": "ab"', '')):
+        metadata = header['__metadata__']['dae_ros']
+        assert old in metadata
+        changed = {**header, '__metadata__': {'dae_ros': metadata.replace(old, new)}}
+        assert reason_for(with_header(changed, body), codec.decode_checkpoint) == 'corrupt'
+
+
 def test_a_checkpoint_whose_tensors_were_exchanged_is_refused():
     header, _ = header_and_body(encoded_checkpoint(0))
     _, body = header_and_body(encoded_checkpoint(1))
@@ -291,6 +300,18 @@ SHAPES = {
 @pytest.mark.parametrize('data', SHAPES.values(), ids=SHAPES)
 def test_tensors_and_sizes_that_do_not_belong_together_are_refused(data):
     assert reason_for(data) == 'wrong_shape'
+
+
+HOSTILE = {'half a character': '\ud800', 'a long one': 'x' * 10**6, 'a new line and a colour': 'a\nb\x1b[31m'}
+
+
+@pytest.mark.parametrize('name', HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_name_in_a_schema_is_refused_with_a_text_that_fits_in_a_line_of_a_log(name):
+    for data in (file_of(**{name: 1}), file_of(format=name), file_of(activation=name)):
+        with pytest.raises(Refused) as caught:
+            codec.decode_policy(data)
+        text = str(caught.value)
+        assert text.encode().decode().isprintable() and len(text) < 1000
 
 
 @pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf], ids=str)

@@ -229,6 +229,12 @@ MALFORMED = {
     'a key that is a list': under_parameters('? [a, b]\n    : 1'),
     'not UTF-8': b'/**:\n  ros__parameters:\n    task: \xff\xfe\n',
     'a control character': '/**:\n  ros__parameters:\n    task: "\x00"\n',
+    'a day that is not in the calendar': under_parameters('seed: 2024-13-45'),
+    'a number that is none': under_parameters('beta: !!float abc'),
+    'a truth that is none': under_parameters('observe_others: !!bool perhaps'),
+    'an integer of no digits': under_parameters('seed: !!int ""'),
+    'brackets without end': '[' * 5000,
+    'parameters that hold themselves': '/**:\n  ros__parameters: &all\n    more: *all\n',
 }
 
 
@@ -264,6 +270,20 @@ def test_a_wrong_entry_of_a_task_file_is_an_error_that_names_it(content, sentenc
     ('task:=pettingzoo:mpe2.simple_spread_v3', ('task', 'pettingzoo:mpe2.simple_spread_v3'))])
 def test_an_override_is_a_name_and_a_value_read_as_yaml(text, override):
     assert config.parse_override(text) == override
+
+
+@pytest.mark.parametrize('text, number', [
+    ('7e-4', 7e-4), ('1e-05', 1e-5), ('1E2', 100.0), ('-2.5e1', -25.0), ('+1.e+3', 1000.0), ('.5', 0.5)])
+def test_a_number_may_be_written_with_an_exponent_as_in_any_parameter_file(text, number):
+    assert read_text(under_parameters(f'learning_rate: {text}')) == {'learning_rate': number}
+    assert config.parse_override(f'learning_rate:={text}') == ('learning_rate', number)
+
+
+@pytest.mark.parametrize('value', ['[', '{a', '*nowhere', '"', '!!float x', '2024-13-45'])
+def test_an_override_whose_value_is_no_yaml_is_an_error_that_shows_it(value):
+    with pytest.raises(SettingsError) as caught:
+        config.parse_override(f'beta:={value}')
+    assert value in str(caught.value) and '\n' not in str(caught.value)
 
 
 @pytest.mark.parametrize('text', ['', 'beta', 'beta=1', ':=1', 'beta:1'])

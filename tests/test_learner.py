@@ -222,7 +222,7 @@ CASES = {
     'other weights of the losses': {'entropy_coefficient': 0.5, 'value_coefficient': 3.0, 'huber_delta': 0.5,
                                     'clip': 0.05, 'gamma': 0.8, 'gae_lambda': 0.6},
     'gradients cut short': {'max_gradient_norm': 0.01},
-    'many worlds': {'worlds': 40, 'chunk_length': 5},
+    'many worlds, in several shards': {'worlds': 400, 'chunk_length': 5},
     'one robot': {'agents': 1, 'worlds': 10},
     'two robots and many worlds': {'agents': 2, 'worlds': 40},
     'six robots': {'agents': 6},
@@ -254,7 +254,8 @@ def test_an_update_is_the_paper_s_formulas_step_by_step(case, make_learner):
         assert learnt.keys() == tensors.keys()
         for name, tensor in tensors.items():
             np.testing.assert_allclose(learnt[name], tensor, rtol=1e-4, atol=2e-6, err_msg=f'{network} {name}')
-        moved = {name: np.abs(tensor - before[f'{network}.parameters.{name}']).max() for name, tensor in tensors.items()}
+        moved = {name: np.abs(tensor - before[f'{network}.parameters.{name}']).max()
+                 for name, tensor in tensors.items()}
         if spec.num_agents == 1:
             moved.pop('action_embedding', None)  # there are no others to learn from
         assert min(moved.values()) > 1e-5, network
@@ -427,6 +428,17 @@ def test_mini_batches_are_shuffled_by_seed_and_rollout_and_each_makes_a_step_of_
         for network in ('actor', 'critic', 'reward_network.0'):
             assert not same_weights(first, other, network)
     assert_same_bits(learnt(1, 0), learnt(1, 1))
+
+
+def test_mini_batches_are_shuffled_anew_in_every_epoch(make_learner):
+    """With weights at rest, the same mini-batches again would have the same gradients."""
+    def norms(epochs):
+        settings = replace(IDLE, chunk_length=5, num_mini_batches=2, epochs=epochs)
+        metrics = updated(make_learner(settings, replace(IDLE_REWARD, epochs=epochs)), range(1), steps=10, worlds=4)
+        return [value for name, value in metrics.items() if name.endswith('gradient_norm')]
+
+    for once, twice in zip(norms(1), norms(2)):
+        assert abs(twice / once - 1) > 1e-4
 
 
 def test_there_may_be_more_mini_batches_than_chunks(make_learner):

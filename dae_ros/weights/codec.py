@@ -60,10 +60,10 @@ def decode_policy(data: bytes) -> Policy:
         architecture = PolicyArchitecture(**schema)
         sizes = architecture[:4]
         if not all(type(size) is int and 0 < size < 2**16 for size in sizes) or architecture.activation not in ('relu', 'tanh'):
-            raise ValueError(f'{architecture}')
+            raise ValueError('sizes that no policy has')
         policy = Policy(architecture, tensors)
     except (TypeError, ValueError) as error:
-        raise Refused(Refused.WRONG_SHAPE, f'not a policy: {error}') from error
+        raise Refused(Refused.WRONG_SHAPE, f'not a policy: {_short(error)}') from error
     for name, tensor in tensors.items():
         if tensor.dtype != np.float32 or not np.isfinite(tensor).all():
             raise Refused(Refused.NOT_FINITE, f'{name} is not all finite 32-bit numbers')
@@ -72,15 +72,19 @@ def decode_policy(data: bytes) -> Policy:
 
 def encode_checkpoint(tensors: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> bytes:
     """A checkpoint file: tensors by name, and facts (JSON values) about the run."""
-    return _encode(CHECKPOINT_FORMAT, tensors, {**facts, 'sha256': tensors_sha256(tensors)})
+    return _encode(CHECKPOINT_FORMAT, tensors, {**facts, 'sha256': _checkpoint_sha256(tensors, facts)})
 
 
 def decode_checkpoint(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors and facts of a checkpoint file. Raises Refused if it is torn, corrupted or something else."""
     tensors, facts = _decode(CHECKPOINT_FORMAT, data)
-    if facts.pop('sha256', None) != tensors_sha256(tensors):
+    if facts.pop('sha256', None) != _checkpoint_sha256(tensors, facts):
         raise Refused(Refused.CORRUPT, 'the checksum does not match')
     return tensors, facts
+
+
+def _checkpoint_sha256(tensors: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> str:
+    return sha256(f'{tensors_sha256(tensors)} {json.dumps(facts, sort_keys=True)}'.encode())
 
 
 def _encode(file_format: str, tensors: Mapping[str, np.ndarray], schema: Mapping[str, Any]) -> bytes:
@@ -97,7 +101,12 @@ def _decode(file_format: str, data: bytes) -> tuple[dict[str, np.ndarray], dict[
         found = schema.pop('format')
         tensors = load(data)
     except (struct.error, ValueError, KeyError, TypeError, AttributeError, SafetensorError, RecursionError) as error:
-        raise Refused(Refused.CORRUPT, f'not a {file_format} file: {type(error).__name__} {error}') from error
+        raise Refused(Refused.CORRUPT, f'not a {file_format} file: {_short(error)}') from error
     if found != file_format:
-        raise Refused(Refused.CORRUPT, f'format {found!r}, expected {file_format!r}')
+        raise Refused(Refused.CORRUPT, f'format {_short(found)}, expected {file_format}')
     return tensors, schema
+
+
+def _short(value: Any) -> str:
+    """What a stranger's file made somebody say, fit for a line of a log."""
+    return ascii(str(value))[:200]
