@@ -30,7 +30,7 @@ class Row(NamedTuple):
     """One line of the table."""
 
     name: str
-    flops: float                 # of the products, as the torch path computes them
+    flops: float                 # of the products, row by row; looking up shared rows saves some of them
     cores: int
     work: Callable[[], object]
 
