@@ -33,7 +33,7 @@ def tensors_sha256(tensors: Mapping[str, np.ndarray]) -> str:
     """SHA-256 over names, types, shapes and bytes of all tensors: equal exactly where all weights are, bit for bit."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
-        tensor = np.ascontiguousarray(tensors[name])
+        tensor = np.asarray(tensors[name], order='C')
         digest.update(f'{name} {tensor.dtype.str} {tensor.shape}\n'.encode())
         digest.update(tensor.tobytes())
     return digest.hexdigest()
@@ -90,7 +90,7 @@ def _checkpoint_sha256(tensors: Mapping[str, np.ndarray], facts: Mapping[str, An
 def _encode(file_format: str, tensors: Mapping[str, np.ndarray], schema: Mapping[str, Any]) -> bytes:
     # One metadata key, because safetensors writes several in no fixed order.
     metadata = {'dae_ros': json.dumps({'format': file_format, **schema}, sort_keys=True)}
-    return save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}, metadata=metadata)
+    return save({name: np.asarray(tensor, order='C') for name, tensor in tensors.items()}, metadata=metadata)
 
 
 def _decode(file_format: str, data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
