@@ -233,7 +233,7 @@ MALFORMED = {
     'a number that is none': under_parameters('beta: !!float abc'),
     'a truth that is none': under_parameters('observe_others: !!bool perhaps'),
     'an integer of no digits': under_parameters('seed: !!int ""'),
-    'brackets without end': '[' * 5000,
+    'brackets without end': '[' * 1000,
     'parameters that hold themselves': '/**:\n  ros__parameters: &all\n    more: *all\n',
 }
 

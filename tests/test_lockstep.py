@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies
+from hypothesis import example, given, settings, strategies
 
 from dae_ros import draws
 from dae_ros.errors import Refused
@@ -576,6 +576,14 @@ def test_an_agent_that_waits_for_a_policy_forgets_the_observation_of_an_attempt_
     assert_same(answer, stamped(ACTIONS[0][0], attempt=2))
 
 
+def test_an_agent_keeps_an_observation_that_came_before_its_request_and_one_more_that_was_given_up():
+    agent = AgentEnd(0)
+    agent.on_policy(VERSION, POLICY)
+    assert agent.on_observation(stamped(OBSERVATIONS[0][0], attempt=2)) is None
+    assert agent.on_request(REQUEST) is None
+    assert_same(agent.on_request(REQUEST._replace(attempt=2)), stamped(ACTIONS[0][0], attempt=2))
+
+
 def test_an_agent_that_waits_for_a_policy_refuses_a_second_observation_of_the_step_whatever_it_holds():
     agent, genuine = AgentEnd(0), OBSERVATIONS[0][0]
     agent.on_request(REQUEST)
@@ -647,6 +655,7 @@ def test_on_a_network_that_reorders_and_repeats_the_team_collects_the_same_rollo
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(seed=strategies.integers(0, 2**32), repeats=strategies.floats(0, 0.4),
        patience=strategies.lists(strategies.integers(0, 40), min_size=1, max_size=2))
+@example(seed=1, repeats=0.0, patience=[0])
 def test_a_rollout_given_up_in_its_middle_is_the_same_when_it_is_begun_anew(seed, repeats, patience):
     network = Network(seed, repeats)
     network.ask(REQUEST)
