@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections import Counter
 from typing import Any, Callable, Iterable
@@ -100,7 +101,15 @@ def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int
     except DaeRosError as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
+    except RuntimeError:
+        # What rclpy raises when a callback still publishes after a signal has shut the context down.
+        if rclpy.ok():
+            raise
+        return 0
     finally:
+        # A terminal and a launch file each send their own Ctrl-C: the second must not break into the cleaning up.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
         if node is not None:
             node.close()
             node.destroy_node()

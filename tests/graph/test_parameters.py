@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 
@@ -80,4 +81,17 @@ def test_every_node_starts_alone_with_its_defaults_in_any_namespace_and_ends_on_
     finally:
         process.terminate()
         _, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 0 and 'Traceback' not in errors, errors
+
+
+def test_a_node_that_is_interrupted_twice_at_once_still_ends_cleanly(domain, tmp_path):
+    process = start('world', cwd=tmp_path)
+    try:
+        with Listener() as listener:
+            listener.call(GetParameters, 'world/get_parameters', GetParameters.Request(names=['num_agents']))
+        for _ in range(2):
+            process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=TIMEOUT)
+    finally:
+        process.kill()
     assert process.returncode == 0 and 'Traceback' not in errors, errors
