@@ -8,13 +8,13 @@ from __future__ import annotations
 from datetime import datetime
 from pathlib import Path
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from dae_ros.ros.graph import find_task_file, node_environment, read_settings, training_graph
 from dae_ros.run_folder import RunFolder
+from launch import LaunchDescription
 
 
 def start(context) -> list:

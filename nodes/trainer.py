@@ -8,14 +8,20 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import rclpy
 from dae_ros_msgs import msg
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from std_srvs.srv import Trigger
 
-from dae_ros.config import (LearnerSettings, RewardNetworkSettings, RunSettings, TaskSettings, TrainerSettings, declarations,
-                            from_flat)
+from dae_ros.config import (
+    LearnerSettings,
+    RewardNetworkSettings,
+    RunSettings,
+    TaskSettings,
+    TrainerSettings,
+    declarations,
+    from_flat,
+)
 from dae_ros.report.final import write_report
 from dae_ros.rollout.assembler import Assembler
 from dae_ros.ros import convert, names, qos

@@ -12,7 +12,7 @@ import numpy as np
 from dae_ros_msgs import msg
 
 from dae_ros.errors import Refused
-from dae_ros.types import (Action, JointState, Observation, PolicyWeights, RolloutRequest, SharedReward, Stamp)
+from dae_ros.types import Action, JointState, Observation, PolicyWeights, RolloutRequest, SharedReward, Stamp
 
 _TYPECODES = {'f': np.float32, 'B': np.uint8, 'H': np.uint16}
 

@@ -15,9 +15,9 @@ from dae_ros_msgs.msg import TrainingStatus
 from rclpy.executors import SingleThreadedExecutor
 
 from dae_ros import config
-from dae_ros.ros import names, qos
 from dae_ros.report.summary import Summary
 from dae_ros.rollout.in_process import train
+from dae_ros.ros import names, qos
 from dae_ros.ros.graph import training_graph
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder

@@ -102,5 +102,6 @@ def test_malformed_and_foreign_messages_are_counted_by_reason_and_change_no_weig
     for name in graph.names:
         log = graph.log(name)
         assert 'Traceback' not in log, log
-        warned = [line.split('refused a message on ')[1].split(':')[0:2] for line in log.splitlines() if 'refused a message' in line]
+        warnings = [line for line in log.splitlines() if 'refused a message on ' in line]
+        warned = [line.split('refused a message on ')[1].split(':')[:2] for line in warnings]
         assert len(warned) == len({tuple(entry) for entry in warned}), log

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 from harness import TIMEOUT, Listener
-from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 
 NODES = ('world', 'agent', 'parameter_server', 'trainer')
 
