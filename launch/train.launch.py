@@ -19,7 +19,8 @@ from launch import LaunchDescription
 
 def start(context) -> list:
     """The nodes of the run that the launch arguments describe; when one ends, all do."""
-    argument = {name: LaunchConfiguration(name).perform(context) for name in ('task_file', 'namespace', 'run_folder', 'parameters')}
+    names = ('task_file', 'namespace', 'run_folder', 'parameters')
+    argument = {name: LaunchConfiguration(name).perform(context) for name in names}
     task_file = find_task_file(argument['task_file'])
     settings = read_settings(task_file, argument['parameters'].split())
     path = argument['run_folder'] or f'runs/{task_file.stem}-{datetime.now():%Y%m%d-%H%M%S}'

@@ -46,7 +46,8 @@ def bad_messages(run: int) -> list[tuple[type, str, object, str]]:
         return msg.JointState(**{**whole, **changes})
 
     def reward(**changes) -> msg.SharedReward:
-        whole = dict(stamp=stamp(), num_worlds=W, state_size=S, reward=floats(W), terminated=ones(W), truncated=array('B', [0]) * W)
+        whole = dict(stamp=stamp(), num_worlds=W, state_size=S, reward=floats(W), terminated=ones(W),
+                     truncated=array('B', [0]) * W)
         return msg.SharedReward(**{**whole, **changes})
 
     def weights(**changes) -> msg.PolicyWeights:
