@@ -329,6 +329,16 @@ def test_the_assembler_says_what_is_missing_until_nothing_is():
     assert assembler.complete
 
 
+@pytest.mark.parametrize('left_out', range(len(FOR_TRAINER)))
+def test_a_rollout_is_complete_with_its_last_datum_whichever_that_is(left_out):
+    assembler = assembler_of()
+    for datum in FOR_TRAINER[:left_out] + FOR_TRAINER[left_out + 1:]:
+        hand_over(assembler, datum)
+    assert not assembler.complete
+    hand_over(assembler, FOR_TRAINER[left_out])
+    assert assembler.complete
+
+
 def test_a_rollout_begun_anew_keeps_nothing_of_the_one_before():
     assembler = assembler_of()
     for datum in FOR_TRAINER[:-1]:
@@ -564,6 +574,23 @@ def test_an_agent_begins_anew_for_a_later_request_and_for_no_other():
     for step in range(T):  # from the first step, without the memory of the attempt before
         answer = agent.on_observation(stamped(OBSERVATIONS[0][step], attempt=2))
         assert_same(answer, stamped(ACTIONS[0][step], attempt=2))
+
+
+def test_an_agent_begins_a_rollout_without_memory_also_where_no_episode_starts_with_it():
+    agent = agent_with(0, 1)
+    agent.on_request(REQUEST._replace(attempt=2))
+    observation = stamped(OBSERVATIONS[0][2], attempt=2, step=0)._replace(episode_start=np.zeros(W, bool))
+    answer = agent.on_observation(observation)
+    probabilities, _ = POLICY.act(observation.values, POLICY.initial_state(W), observation.episode_start)
+    np.testing.assert_array_equal(answer.probabilities, probabilities)
+
+
+def test_an_agent_takes_another_number_of_worlds_with_a_new_rollout():
+    agent = agent_with(0, 1)
+    agent.on_request(REQUEST._replace(rollout=4))
+    first = stamped(OBSERVATIONS[0][0], rollout=4)
+    answer = agent.on_observation(first._replace(values=first.values[:2], episode_start=first.episode_start[:2]))
+    assert answer.actions.shape == (2,)
 
 
 def test_an_agent_that_waits_for_a_policy_forgets_the_observation_of_an_attempt_given_up():

@@ -19,7 +19,7 @@ UPDATES = 5
 SMALL = {'seed': 3, 'learner_threads': 1, 'hidden_size': 8, 'reward_network.hidden_size': 8, 'epochs': 2,
          'reward_network.epochs': 2, 'chunk_length': 4, 'evaluation_episodes': 10, 'checkpoint_interval': 2}
 NAVIGATION = {**SMALL, 'task': 'navigation', 'num_agents': 3, 'num_worlds': 4, 'num_steps': 10, 'episode_steps': 5,
-              'total_steps': 40 * UPDATES}
+              'total_steps': 40 * UPDATES, 'num_mini_batches': 2}
 MATRIX_GAME = {**SMALL, 'task': 'matrix_game', 'num_agents': 4, 'num_worlds': 3, 'num_steps': 8,
                'total_steps': 24 * UPDATES}
 TASKS = pytest.mark.parametrize('values', [NAVIGATION, MATRIX_GAME], ids=['navigation', 'matrix game'])
@@ -124,6 +124,16 @@ def test_an_interrupted_training_ends_as_if_nothing_had_happened(begin, undistur
     resumed = begin(values, 'disturbed')
     assert resumed.training.policy_version == saved
     assert_same_end(resumed.train(), undisturbed(values))
+
+
+def test_a_resumed_training_knows_how_far_it_was_and_how_long_it_took(begin):
+    killed = begin(NAVIGATION, 'disturbed', checkpoint_interval=1).train(stop_after=3)
+    resumed = begin(NAVIGATION, 'disturbed', checkpoint_interval=1).training
+    assert resumed.run == killed.training.run and resumed.environment_steps == 3 * 40
+    assert resumed.mean_return == killed.training.mean_return
+    assert 0 < resumed.seconds <= killed.training.seconds
+    assert resumed.steps_per_second == 0
+    assert resumed.request().rollout == 3
 
 
 def test_a_training_may_be_interrupted_again_and_again(begin, undisturbed):
