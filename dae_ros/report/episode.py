@@ -77,14 +77,13 @@ def _record(task: str, worlds, policy: Policy, seed: int) -> Episodes:
 def draw_animation(episodes: Episodes, path: Path) -> None:
     """Writes a GIF of the episodes side by side. Only for tasks whose robots have a place."""
     figure = _figure(2.7 * EPISODES, 3.0, dpi=80)
-    panels = figure.subplots(1, EPISODES)
+    panels = [_Panel(axes, episodes, episode) for episode, axes in enumerate(figure.subplots(1, EPISODES))]
     figure.draw_without_rendering()
     figure.set_layout_engine('none')  # laid out once: doing it for every frame takes most of the time
     frames = []
     for step in range(episodes.lengths.max()):
-        for episode, axes in enumerate(panels):
-            axes.clear()
-            _draw_places(axes, episodes, episode, step)
+        for panel in panels:
+            panel.show(step)
         figure.canvas.draw()
         frames.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert('P', palette=Image.Palette.ADAPTIVE))
     durations = [FRAME_MILLISECONDS] * (len(frames) - 1) + [LAST_FRAME_MILLISECONDS]
@@ -96,10 +95,10 @@ def draw_strip(episodes: Episodes, path: Path) -> None:
     if episodes.positions is None:
         _draw_actions(episodes, path)
         return
-    figure = _figure(2.2 * STRIP_FRAMES, 2.6, dpi=150)
+    figure = _figure(2.2 * STRIP_FRAMES, 2.4, dpi=150)
     moments = np.linspace(0, episodes.lengths[0] - 1, STRIP_FRAMES).round().astype(int)
     for axes, step in zip(figure.subplots(1, STRIP_FRAMES), moments):
-        _draw_places(axes, episodes, 0, step)
+        _Panel(axes, episodes, 0).show(step)
     figure.savefig(path, format='png')
 
 
@@ -109,23 +108,37 @@ def _figure(width: float, height: float, dpi: int) -> Figure:
     return figure
 
 
-def _draw_places(axes: Axes, episodes: Episodes, episode: int, step: int) -> None:
-    """One moment: targets as rings, robots as discs of their size with the way they came."""
-    step = min(step, episodes.lengths[episode] - 1)
-    so_far = episodes.positions[:step + 1, episode]
-    for x, y in episodes.targets[step, episode]:
-        axes.add_patch(Circle((x, y), max(episodes.radius, 0.05) * 1.25, fill=False, edgecolor=INK, linewidth=1.2))
-        axes.plot(x, y, marker='+', color=INK, markersize=6, markeredgewidth=1.0)
-    for robot in range(so_far.shape[1]):
-        colour = ROBOTS[robot % len(ROBOTS)]
-        axes.plot(*so_far[:, robot].T, color=colour, linewidth=1.4, alpha=0.45)
-        axes.add_patch(Circle(so_far[-1, robot], episodes.radius, color=colour, alpha=0.85, linewidth=0))
-    reach = max(1.15, float(np.abs(episodes.positions[:, episode]).max()) + 0.1)
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect='equal', xticks=[], yticks=[])
-    for spine in axes.spines.values():
-        spine.set_color(FAINT)
-    gained = episodes.rewards[:step, episode].sum()
-    axes.set_title(f'step {step}   return {signed(gained)}', fontsize=9, color=INK)
+class _Panel:
+    """One episode: targets as rings, robots as discs of their size with the way they came."""
+
+    def __init__(self, axes: Axes, episodes: Episodes, episode: int):
+        length = episodes.lengths[episode]
+        self._positions = episodes.positions[:length, episode]  # [T, N, 2]
+        self._targets = episodes.targets[:length, episode]      # [T, N, 2]
+        self._returns = np.concatenate([[0.0], np.cumsum(episodes.rewards[:length, episode])])
+        reach = max(1.15, float(np.abs(self._positions).max()) + episodes.radius)
+        axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect='equal', xticks=[], yticks=[])
+        for spine in axes.spines.values():
+            spine.set_color(FAINT)
+        self._title = axes.set_title(' ', fontsize=9, color=INK)
+        ring = max(episodes.radius, 0.05) * 1.25
+        self._rings = [axes.add_patch(Circle((0, 0), ring, fill=False, edgecolor=INK, linewidth=1.2)) for _ in self._targets[0]]
+        self._marks, = axes.plot([], [], linestyle='', marker='+', color=INK, markersize=6, markeredgewidth=1.0)
+        colours = [ROBOTS[robot % len(ROBOTS)] for robot in range(self._positions.shape[1])]
+        self._trails = [axes.plot([], [], color=colour, linewidth=1.4, alpha=0.45)[0] for colour in colours]
+        self._robots = [axes.add_patch(Circle((0, 0), episodes.radius, color=colour, alpha=0.85, linewidth=0))
+                        for colour in colours]
+
+    def show(self, step: int) -> None:
+        """Brings the panel to `step`, or to the episode's last one."""
+        step = min(step, len(self._positions) - 1)
+        self._title.set_text(f'step {step}   return {signed(self._returns[step])}')
+        self._marks.set_data(*self._targets[step].T)
+        for ring, place in zip(self._rings, self._targets[step]):
+            ring.set_center(place)
+        for trail, disc, way in zip(self._trails, self._robots, self._positions[:step + 1].transpose(1, 2, 0)):
+            trail.set_data(*way)
+            disc.set_center(way[:, -1])
 
 
 def _draw_actions(episodes: Episodes, path: Path) -> None:
