@@ -33,10 +33,10 @@ class AgentNode(TeamNode):
         self._topic = names.OBSERVATION.format(robot)
         self._actions = self.publisher(msg.Action, names.ACTION.format(robot), qos.ROLLOUT)
         self._get_policy = self.create_client(srv.GetPolicy, names.GET_POLICY)
-        self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED, self._on_policy)
-        self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED, self._on_status)
-        self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED, self._on_request)
-        self.listen(msg.Observation, self._topic, qos.LATCHED, self._on_observation)
+        self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED_INPUT, self._on_policy)
+        self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
+        self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED_INPUT, self._on_request)
+        self.listen(msg.Observation, self._topic, qos.LATCHED_INPUT, self._on_observation)
 
     def on_matched(self) -> None:
         if self._unsent is not None and self._actions.get_subscription_count() >= LISTENERS:
@@ -44,8 +44,10 @@ class AgentNode(TeamNode):
             self._actions.publish(unsent)
 
     def _on_request(self, message: msg.RolloutRequest) -> None:
-        self._act(self._end.on_request(convert.rollout_request(message)))
-        self._fetch_if_passed()
+        try:
+            self._act(self._end.on_request(convert.rollout_request(message)))
+        finally:
+            self._fetch_if_passed()
 
     def _on_observation(self, message: msg.Observation) -> None:
         self._act(self._end.on_observation(convert.observation(message)))

@@ -77,7 +77,7 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
     os.environ.update(node_environment())  # for this process too: it must hear the status
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node('bringup', namespace=namespace, start_parameter_services=False)
-    node.create_subscription(TrainingStatus, names.TRAINING_STATUS, lambda status: events.put(('status', status)), qos.LATCHED)
+    node.create_subscription(TrainingStatus, names.TRAINING_STATUS, lambda status: events.put(('status', status)), qos.LATCHED_INPUT)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
 

@@ -34,8 +34,8 @@ class ParameterServerNode(TeamNode):
         self._policy = self.publisher(msg.PolicyWeights, names.POLICY, qos.LATCHED)
         if self._bound:
             self._open_store()
-        self.listen(msg.PolicyWeights, names.POLICY_UPDATE, qos.LATCHED, self._on_update)
-        self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED, self._on_status)
+        self.listen(msg.PolicyWeights, names.POLICY_UPDATE, qos.LATCHED_INPUT, self._on_update)
+        self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
         self.create_service(srv.GetPolicy, names.GET_POLICY, self._on_get_policy)
 
     def _open_store(self) -> None:

@@ -32,8 +32,8 @@ class WorldNode(TeamNode):
         self._joint_state = self.publisher(msg.JointState, names.JOINT_STATE, qos.ROLLOUT)
         self._shared_reward = self.publisher(msg.SharedReward, names.SHARED_REWARD, qos.ROLLOUT)
         self._actions = [self.listen(msg.Action, names.ACTION.format(i), qos.ROLLOUT, self._on_action) for i in robots]
-        self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED, self._on_status)
-        self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED, self._on_request)
+        self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
+        self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED_INPUT, self._on_request)
 
     def on_matched(self) -> None:
         self._begin_if_ready()

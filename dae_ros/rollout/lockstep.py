@@ -161,10 +161,11 @@ class AgentEnd:
         if self.request is not None and (request.rollout, request.attempt) <= (self.request.rollout, self.request.attempt):
             raise Refused(Refused.STALE, f'request for rollout {request.rollout} attempt {request.attempt}')
         self.run, self.request, self._next_step, self._state, self._pending = request.run, request, 0, None, None
-        early, self._early = self._early, None
-        if early is not None and early.stamp[:3] == (request.run, request.rollout, request.attempt):
-            return self.on_observation(early)
-        return None
+        early, asked = self._early, (request.rollout, request.attempt)
+        if early is None or (early.stamp.rollout, early.stamp.attempt) > asked:
+            return None
+        self._early = None
+        return self.on_observation(early) if (early.stamp.rollout, early.stamp.attempt) == asked else None
 
     def on_policy(self, version: int, policy: Policy) -> Action | None:
         """Takes in one version of the policy; the two newest and the one in use are kept."""
@@ -196,6 +197,8 @@ class AgentEnd:
         if observation.policy_version != request.policy_version:
             raise Refused(Refused.WRONG_VERSION, f'policy version {observation.policy_version}, the rollout asked for '
                                                  f'{request.policy_version}')
+        if self._pending is not None:
+            raise Refused(Refused.DUPLICATE, f'step {stamp.step}, whose observation waits for its policy')
         if self._state is not None and len(observation.values) != len(self._state):
             raise Refused(Refused.WRONG_SHAPE, f'{len(observation.values)} worlds, the rollout began with {len(self._state)}')
         self._pending = observation

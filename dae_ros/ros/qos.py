@@ -13,7 +13,10 @@ def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
 
 
 LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
-"""The last value is what counts, also for who comes late: requests, policies, status, pending observations."""
+"""For publishers whose last value is what counts, also for who comes late: requests, policies, status, observations."""
+
+LATCHED_INPUT = _reliable(32, DurabilityPolicy.TRANSIENT_LOCAL)
+"""For those who listen to such a topic: deep enough that a stranger's message does not push out a genuine one."""
 
 ROLLOUT = _reliable(1024, DurabilityPolicy.VOLATILE)
 """Every datum of a rollout counts: joint states, rewards, actions."""

@@ -59,7 +59,8 @@ def decode_policy(data: bytes) -> Policy:
     try:
         architecture = PolicyArchitecture(**schema)
         sizes = architecture[:4]
-        if not all(type(size) is int and 0 < size < 2**16 for size in sizes) or architecture.activation not in ('relu', 'tanh'):
+        if (not all(type(size) is int and 0 < size < 2**16 for size in sizes) or architecture.mlp_layers > len(tensors)
+                or architecture.activation not in ('relu', 'tanh')):
             raise ValueError('sizes that no policy has')
         policy = Policy(architecture, tensors)
     except (TypeError, ValueError) as error:

@@ -25,9 +25,10 @@ class PolicyStore:
         return sorted(int(name) for name in names if name.isdecimal())
 
     def save(self, version: int, data: bytes) -> None:
-        """Writes one version and deletes the oldest beyond those kept."""
+        """Writes one version and deletes the oldest others beyond those kept."""
         write_atomically(self._path(version), data)
-        for old in self.versions()[:-self._keep]:
+        others = [other for other in self.versions() if other != version]
+        for old in others[:max(0, len(others) - self._keep + 1)]:
             self._path(old).unlink(missing_ok=True)
 
     def load(self, version: int) -> bytes | None:

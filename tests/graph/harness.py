@@ -125,17 +125,17 @@ class Listener:
         self.node.destroy_node()
         self.context.try_shutdown()
 
-    def spin_until(self, condition: Callable[[], bool]) -> None:
-        """Takes messages in until `condition` holds; AssertionError if it never does."""
+    def spin_until(self, condition: Callable[[], bool], missing: Callable[[], str] = lambda: 'waited in vain') -> None:
+        """Takes messages in until `condition` holds; AssertionError that says what is `missing` if it never does."""
         deadline = time.monotonic() + TIMEOUT
         while not condition():
-            assert time.monotonic() < deadline, 'waited in vain'
+            assert time.monotonic() < deadline, missing()
             self.executor.spin_once(timeout_sec=1.0)
 
     def wait_for_status(self, condition: Callable[[TrainingStatus], bool]) -> TrainingStatus:
         """The first status that fulfils `condition`."""
         heard: list[TrainingStatus] = []
-        subscription = self.node.create_subscription(TrainingStatus, names.TRAINING_STATUS, heard.append, qos.LATCHED)
+        subscription = self.node.create_subscription(TrainingStatus, names.TRAINING_STATUS, heard.append, qos.LATCHED_INPUT)
         self.spin_until(lambda: any(condition(status) for status in heard))
         self.node.destroy_subscription(subscription)
         return next(status for status in heard if condition(status))
