@@ -77,7 +77,8 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
     os.environ.update(node_environment())  # for this process too: it must hear the status
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node('bringup', namespace=namespace, start_parameter_services=False)
-    node.create_subscription(TrainingStatus, names.TRAINING_STATUS, lambda status: events.put(('status', status)), qos.LATCHED_INPUT)
+    node.create_subscription(TrainingStatus, names.TRAINING_STATUS, lambda status: events.put(('status', status)),
+                             qos.LATCHED_INPUT)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
 
@@ -94,13 +95,19 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
                        *process.arguments(folder.settings_file, namespace)]
             supervisor.start(process.name, command, os.environ)
         spinning.start()
+        detail = ''
         while True:
             name, event = events.get()
             if name == 'status':
                 if event.run == folder.run:
-                    display.update(event.detail or states.get(event.state, '?'), event.environment_steps, event.total_steps,
+                    display.update(states.get(event.state, '?'), event.environment_steps, event.total_steps,
                                    event.mean_return, event.steps_per_second, event.policy_version)
+                    if event.detail not in ('', detail):
+                        display.note(event.detail)
+                    detail = event.detail
             elif name == 'trainer' and event == 0:
+                if not folder.summary_file.exists():
+                    raise DaeRosError(f'the trainer was stopped before its end; --run-folder {folder.path} goes on from there')
                 return
             else:
                 tail = supervisor.log_file(name).read_text(errors='replace').splitlines()[-LOG_TAIL:]

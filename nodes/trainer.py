@@ -138,7 +138,7 @@ class TrainerNode(TeamNode):
     def _finish(self) -> None:
         self._announce(Status.EVALUATING, 'drawing the report')
         write_report(self._training, self._folder)
-        self._announce(Status.FINISHED, f'the run is in {self._folder.path}')
+        self._announce(Status.FINISHED, '')
         self._status.wait_for_all_acked(FAREWELL)
         self.done = True
 

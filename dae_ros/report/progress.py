@@ -7,7 +7,9 @@ import sys
 import time
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn
+
+from dae_ros.report.style import compact, signed
 
 LINE_PERIOD = 5.0  # s between two lines where there is no terminal
 
@@ -17,8 +19,7 @@ class ProgressDisplay:
 
     def __init__(self):
         self._console = Console(file=sys.stdout, highlight=False)
-        columns = (TextColumn('{task.description}'), BarColumn(bar_width=None), TextColumn('{task.fields[facts]}'),
-                   TimeElapsedColumn())
+        columns = (TextColumn('{task.description}'), BarColumn(bar_width=None), TextColumn('{task.fields[facts]}'))
         self._progress = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
         self._bar = self._progress.add_task('starting', total=None, facts='')
         self._state = ''
@@ -38,25 +39,28 @@ class ProgressDisplay:
     def update(self, state: str, environment_steps: int, total_steps: int, mean_return: float, steps_per_second: float,
                policy_version: int) -> None:
         """Shows the run as it stands."""
-        left = (total_steps - environment_steps) / steps_per_second if steps_per_second else math.nan
-        facts = (f'{environment_steps:,} of {total_steps:,} steps, return {mean_return:.1f}, '
-                 f'{steps_per_second:,.0f} steps/s, policy {policy_version}, {_duration(left)} left')
+        if state in ('collecting', 'learning'):
+            state = 'training'  # they take turns several times a second
+        facts = f'{_rounded(environment_steps)}/{_rounded(total_steps)} steps'
+        if math.isfinite(mean_return):
+            facts += f', return {signed(mean_return)}'
+        if steps_per_second:
+            left = (total_steps - environment_steps) / steps_per_second
+            facts += f', {steps_per_second:,.0f}/s, policy {policy_version}, {_duration(left)} left'
         self._progress.update(self._bar, description=state, completed=environment_steps, total=total_steps, facts=facts)
         now = time.monotonic()
-        if self._progress.disable and (now - self._printed_at > LINE_PERIOD or _phase(state) != _phase(self._state)):
+        if self._progress.disable and (now - self._printed_at > LINE_PERIOD or state != self._state):
             self._printed_at = now
             self.note(f'{state}: {facts}')
         self._state = state
 
 
-def _phase(state: str) -> str:
-    """Collecting and learning take turns several times a second; only what lasts is worth a line of its own."""
-    return 'training' if state in ('collecting', 'learning') else state
+def _rounded(steps: int) -> str:
+    """Three digits are what fits into a terminal of 80 columns."""
+    return compact(float(f'{steps:.3g}'))
 
 
 def _duration(seconds: float) -> str:
     """Minutes and seconds, for people."""
-    if not math.isfinite(seconds):
-        return '?'
     minutes, rest = divmod(round(seconds), 60)
     return f'{minutes}:{rest:02d}'
