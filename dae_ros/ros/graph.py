@@ -37,7 +37,8 @@ def training_graph(settings: Settings, folder: RunFolder) -> list[NodeProcess]:
     return [
         NodeProcess('world', 'world', run),
         *agents,
-        NodeProcess('parameter_server', 'parameter_server', {'policies_folder': str(folder.policies), **run}),
+        NodeProcess('parameter_server', 'parameter_server',
+                    {'policies_folder': str(folder.policies), 'keep_policies': settings.run.keep_checkpoints, **run}),
         NodeProcess('trainer', 'trainer', {'run_folder': str(folder.path)}),
     ]
 

@@ -8,7 +8,10 @@ import signal
 import subprocess
 
 import pytest
-from harness import SMALL, TIMEOUT, Listener, bringup, finish, processes_naming
+from harness import SMALL, TIMEOUT, Listener, bringup, finish, oracle, processes_naming
+
+from dae_ros.report.metrics import read_metrics
+from dae_ros.report.summary import Summary
 
 LONG = {**SMALL, 'total_steps': 10**7}
 
@@ -46,6 +49,22 @@ def test_an_interrupted_run_stops_every_process(number, long_run, tmp_path):
     assert not processes_naming(str(tmp_path))
     logs = [path.read_text() for path in (tmp_path / 'run' / 'logs').iterdir()]
     assert len(logs) == 6 and not any('Traceback' in log for log in logs), logs
+
+
+def test_an_interrupted_run_goes_on_from_its_checkpoint_to_the_same_weights(domain, tmp_path):
+    values = {**SMALL, 'total_steps': 60 * 8 * 25, 'checkpoint_interval': 5}
+    process = bringup(tmp_path / 'run', values)
+    with Listener() as listener:
+        listener.wait_for_status(lambda status: status.policy_version >= 7)
+    process.send_signal(signal.SIGINT)
+    assert finish(process)[0] == 130
+    assert not (tmp_path / 'run' / 'summary.json').exists()
+    code, _, errors = finish(bringup(tmp_path / 'run', values))
+    assert code == 0, errors
+    summary = Summary.read(tmp_path / 'run' / 'summary.json')
+    assert (summary.weights_sha256, summary.evaluation_return) == oracle(tmp_path / 'alone', values)
+    steps = read_metrics(tmp_path / 'run' / 'metrics.csv')['environment_steps']
+    assert list(steps) == [200 * (update + 1) for update in range(60)]
 
 
 def test_nodes_end_when_bringup_itself_is_killed(long_run, tmp_path):
