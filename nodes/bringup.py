@@ -43,7 +43,7 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
 
 def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDisplay) -> None:
     """The run without ROS. Raises KeyboardInterrupt through; what was checkpointed stays."""
-    from dae_ros.report.final import write_report
+    from dae_ros.final_report import write_report
     from dae_ros.rollout.in_process import train
     from dae_ros.training import Training
     from dae_ros.worlds import make_worlds

@@ -22,7 +22,7 @@ from dae_ros.config import (
     declarations,
     from_flat,
 )
-from dae_ros.report.final import write_report
+from dae_ros.final_report import write_report
 from dae_ros.rollout.assembler import Assembler
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
