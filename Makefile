@@ -2,11 +2,11 @@
 # PYTHON names the interpreter for .venv; without it, set-up takes the first suitable one it finds.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help build demo test lint lock clean
+.PHONY: help build demo test bench-peers lint lock clean
 export PYTHON
 
 help:  ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-6s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
 
 build:  ## set up .venv and build both packages; does nothing when that is done
 	@scripts/setup.sh
@@ -17,6 +17,9 @@ demo: build  ## train cooperative navigation over a ROS graph on this machine; A
 test: build  ## run every test; ARGS goes to pytest
 	@. scripts/env.sh && exec python -m pytest $(ARGS)
 
+bench-peers: build  ## compare with BenchMARL, VMAS, JaxMARL and mpe2; ARGS='--jaxmarl /path/to/checkout --rounds 5'
+	@. scripts/env.sh && exec python -m benchmarks.peers $(ARGS)
+
 lint: build  ## check the style with ruff
 	@.venv/bin/ruff check $(ARGS)
 
@@ -24,5 +27,5 @@ lock: build  ## choose the versions in requirements/*.txt anew
 	@scripts/lock.sh
 
 clean:  ## remove what set-up and tests made; runs/ stays
-	@rm -rf .venv build install log .pytest_cache .hypothesis .ruff_cache
+	@rm -rf .venv .peers build install log .pytest_cache .hypothesis .ruff_cache
 	@find . -name __pycache__ -prune -exec rm -rf {} +
