@@ -58,7 +58,7 @@ class Running:
         self._answers = os.fdopen(answers)
         with open(self._log, 'wb') as log:
             self._process = subprocess.Popen(
-                [python, DRIVERS / contender.driver, *contender.arguments], cwd=folder, pass_fds=[answer], text=True,
+                [python, DRIVERS / contender.driver, *contender.arguments], cwd=folder, pass_fds=[answer], bufsize=0,
                 env={**variables, 'BENCHMARK_ANSWERS': str(answer)}, stdin=subprocess.PIPE, stdout=log, stderr=log)
         os.close(answer)
 
@@ -85,7 +85,7 @@ class Running:
 
     def _work(self, units: int) -> float:
         try:
-            print(units, file=self._process.stdin, flush=True)
+            self._process.stdin.write(f'{units}\n'.encode())
         except BrokenPipeError:
             pass  # the missing answer says more
         return self._answer(LONGEST_BLOCK)['seconds']
