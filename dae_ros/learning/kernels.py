@@ -1,9 +1,9 @@
-"""The native layers as differentiable torch operations, and whether they can be had here.
+"""The compiled kernels from Python: a network's outputs, and the gradient of a loss of them, in one call each.
 
 `library` is chosen once, at import: the compiled kernels, or None where there is no C compiler or where the environment
-variable DAE_ROS_KERNELS is `torch`; then, and for tensors that are not float32 on the CPU, `networks` computes the
-same with torch's own operations. The two differ by rounding, so a run keeps to one of them. Calls give up Python's
-lock: threads run side by side.
+variable DAE_ROS_KERNELS is `torch`; then, and for tensors that are not float32 on the CPU, `networks` computes the same
+with torch's own operations. The two differ by rounding, so a run keeps to one of them. Calls give up Python's lock:
+threads run side by side.
 """
 
 from __future__ import annotations
@@ -15,26 +15,59 @@ from typing import NamedTuple, Sequence
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from dae_ros.learning.native.build import BuildError, library_path
 
+_KINDS = {'layer': 0, 'gru': 1, 'fan_out': 2}
 _ACTIVATIONS = {'identity': 0, 'relu': 1, 'tanh': 2}
-
-# Sizes and addresses each kernel takes.
-_SIGNATURES = {'gru_forward': (4, 9), 'gru_backward': (4, 14), 'layer_forward': (4, 8), 'layer_backward': (4, 11),
-               'looked_up_forward': (3, 8), 'looked_up_backward': (4, 9)}
+_LOSSES = {'policy': 0, 'value': 1, 'reward': 2}
+_MOST_SUMS = 4
 
 
 class Step(NamedTuple):
-    """One step of a chain: a GRU, or LayerNorm(activation(x weight^T + bias)) of which any part may be left out.
+    """One step of a network; what it computes is said in native/kernels.c, with the shapes of its parameters."""
 
-    Parameters of a GRU: weight_ih, weight_hh, bias_ih, bias_hh, as in `gru.gru_sequence`; otherwise weight [O, I] and
-    bias [O], scale and shift [O] of the LayerNorm.
-    """
-
-    kind: str  # 'gru', or the activation: 'identity', 'relu' or 'tanh'
+    kind: str        # 'layer', 'gru' or 'fan_out'
+    activation: str  # of a layer: 'identity', 'relu' or 'tanh'
+    inputs: int
+    outputs: int
     parameters: tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]
+
+
+class Batch(NamedTuple):
+    """L steps of C columns, which are worlds or pieces of their history, of N agents each."""
+
+    inputs: Tensor         # [L, C, R, I] with R = N, or 1 for the team as a whole
+    initial: Tensor        # [C, rows at the GRU, H] its state before the first step
+    episode_start: Tensor  # [L, C] bool; its state is zeroed before those steps
+    num_agents: int        # N
+    table: Tensor | None = None  # [K, O] what a fan-out adds
+    codes: Tensor | None = None  # [L, C, N] int64 which row of it; None: one after another, K = L C N
+
+
+class LossTerms(NamedTuple):
+    """A loss as the kernels take it (see native/kernels.c)."""
+
+    kind: str                   # 'policy', 'value' or 'reward'
+    numbers: tuple[float, ...]  # at most 3
+    actions: Tensor | None      # [L, C, N] int64
+    data: tuple[Tensor, ...]    # at most 2
+    weights: Tensor             # [L, C]
+
+
+class _Step(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_long) for name in ('kind', 'activation', 'inputs', 'outputs')]
+    _fields_ += [('parameters', ctypes.c_void_p * 4), ('gradients', ctypes.c_void_p * 4)]
+
+
+class _Batch(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_long) for name in ('length', 'columns', 'agents', 'rows', 'table_rows')]
+    _fields_ += [(name, ctypes.c_void_p) for name in ('inputs', 'initial', 'start', 'table', 'codes')]
+
+
+class _Loss(ctypes.Structure):
+    _fields_ = [('kind', ctypes.c_long), ('numbers', ctypes.c_double * 3), ('actions', ctypes.c_void_p),
+                ('data', ctypes.c_void_p * 2), ('weights', ctypes.c_void_p)]
 
 
 def _load() -> ctypes.CDLL | None:
@@ -45,14 +78,18 @@ def _load() -> ctypes.CDLL | None:
         return None
     try:
         with library_path() as path:
-            loaded = ctypes.CDLL(str(path))
+            return opened(path)
     except (BuildError, OSError) as error:
         warnings.warn(f'the learner runs without its native kernels, several times slower: {error}', stacklevel=2)
         return None
-    for name, (sizes, pointers) in _SIGNATURES.items():
-        function = getattr(loaded, name)
-        function.argtypes = [ctypes.c_long] * sizes + [ctypes.c_void_p] * pointers
-        function.restype = ctypes.c_int
+
+
+def opened(path: os.PathLike | str) -> ctypes.CDLL:
+    """The library at `path`, ready to be called."""
+    loaded = ctypes.CDLL(str(path))
+    steps, batch, address = ctypes.POINTER(_Step), ctypes.POINTER(_Batch), ctypes.c_void_p
+    loaded.network_forward.argtypes = [steps, ctypes.c_long, batch, address, address]
+    loaded.network_gradient.argtypes = [steps, ctypes.c_long, batch, ctypes.POINTER(_Loss), address, address]
     loaded.keep_freed_memory()
     return loaded
 
@@ -67,158 +104,88 @@ def usable(*tensors: Tensor) -> bool:
     return library is not None and all(x.dtype == torch.float32 and x.device.type == 'cpu' for x in tensors)
 
 
-def chain(steps: Sequence[Step], x: Tensor, initial: Tensor | None = None,
-          episode_start: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-    """The steps one after another, of which at most one is a GRU; then x is [L, R, I].
+def forward(steps: Sequence[Step], batch: Batch) -> tuple[Tensor, Tensor]:
+    """Outputs [L, C, rows, K] of the last step, and the GRU's states [L, C, rows, H] after each step of time, which are
+    empty if there is none."""
+    L, C = batch.episode_start.shape
+    rows, rows_of_states = _rows(steps, batch)
+    outputs = batch.inputs.new_empty(L, C, rows, steps[-1].outputs)
+    states = batch.inputs.new_empty(L, C, rows_of_states, batch.initial.shape[-1] if rows_of_states else 0)
+    kept, taken = _batch(steps, batch)
+    _check(library.network_forward(_steps(steps, {}), len(steps), taken, outputs.data_ptr(), states.data_ptr()))
+    del kept
+    return outputs, states
 
-    initial: the GRU's state before the first step [R, H]. episode_start: [L, R] bool; its state is zeroed before those
-    steps. Returns what the last step gives [..., O], and the GRU's states [L, R, H].
+
+def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
+             loss: LossTerms) -> tuple[Tensor, Tensor | None, Tensor]:
+    """Gradient of a loss of what `forward` gives.
+
+    parameters: those of the steps, and others. Returns their gradients one after another in one flat vector, zeros for
+    the others; the table's gradient [K, O]; and the loss's sums [4], of which the kind of loss says how many there are.
     """
-    kinds = tuple(step.kind for step in steps)
-    parameters = [part for step in steps for part in step.parameters]
-    if _tracked(x, initial, *parameters):
-        return _Chain.apply(kinds, x, initial, episode_start, *parameters)
-    parameters = _contiguous(parameters)
-    x, initial, start = _contiguous((x, initial, episode_start))
-    states = None
-    for index, kind in enumerate(kinds):
-        own = parameters[4 * index:4 * index + 4]
-        if kind == 'gru':
-            x = states = _gru_forward(x, initial, start, own, None)
-        else:
-            x = _layer_forward(x, kind, own, None, None)
-    return x, states
+    flat = torch.zeros(sum(parameter.numel() for parameter in parameters))
+    offsets, offset = {}, flat.data_ptr()
+    for parameter in parameters:
+        offsets[parameter.data_ptr()] = offset
+        offset += 4 * parameter.numel()
+    grad_table = None if batch.table is None else torch.zeros_like(batch.table)
+    sums = torch.zeros(_MOST_SUMS, dtype=torch.float64)
+    actions, weights, *data = kept = _contiguous((loss.actions, loss.weights, *loss.data))
+    numbers = loss.numbers + (0.0,) * (3 - len(loss.numbers))
+    addresses = [_address(x) for x in data] + [None] * (2 - len(data))
+    terms = _Loss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _address(actions),
+                  (ctypes.c_void_p * 2)(*addresses), _address(weights))
+    kept_too, taken = _batch(steps, batch)
+    _check(library.network_gradient(_steps(steps, offsets), len(steps), taken, terms, _address(grad_table),
+                                    sums.data_ptr()))
+    del kept, kept_too
+    return flat, grad_table, sums.float()
 
 
-def looked_up(table: Tensor, codes: Tensor | None, shared: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
-    """LayerNorm(relu(table[codes] + shared)), without writing down what is normalised.
-
-    table: [K, O]. codes: [M, N] int64 in 0 .. K - 1, or None: one row of the table after another, K = M N.
-    shared: [M, O]. scale and shift [O]: of the LayerNorm. Returns [M, N, O].
-    """
-    if _tracked(table, shared, scale, shift):
-        return _LookedUp.apply(table, codes, shared, scale, shift)
-    table, codes, shared, scale, shift = _contiguous((table, codes, shared, scale, shift))
-    y = _looked_up_output(table, codes, shared)
-    M, N, O = y.shape
-    _call('looked_up_forward', (M * N, N, O), codes, table, shared, scale, shift, y, None, y)
-    return y
+def _rows(steps: Sequence[Step], batch: Batch) -> tuple[int, int]:
+    """Rows per column at the end and at the GRU (0: there is none)."""
+    rows, at_gru = batch.inputs.shape[2], 0
+    for step in steps:
+        if step.kind == 'fan_out':
+            rows = batch.num_agents
+        elif step.kind == 'gru':
+            at_gru = rows
+    return rows, at_gru
 
 
-class _Chain(torch.autograd.Function):
-    """All steps in one operation: autograd's own work per operation would cost as much as a small layer."""
-
-    @staticmethod
-    def forward(ctx, kinds, x, initial, start, *parameters):
-        ctx.kinds = kinds
-        ctx.set_materialize_grads(False)
-        parameters = _contiguous(parameters)
-        x, initial, start = _contiguous((x, initial, start))
-        saved, states = [], None
-        for index, kind in enumerate(kinds):
-            own, inputs = parameters[4 * index:4 * index + 4], x
-            if kind == 'gru':
-                gates = x.new_empty(*x.shape[:2], 4 * initial.shape[1])
-                x = states = _gru_forward(inputs, initial, start, own, gates)
-                saved += [inputs, states, gates]
-            else:
-                weight, scale = own[0], own[2]
-                width = x.shape[-1] if weight is None else len(weight)
-                # The kernel writes `activated` only where it is neither the layer's input nor its output.
-                apart = scale is not None and (weight is not None or kind != 'identity')
-                activated = x.new_empty(*x.shape[:-1], width) if apart else None
-                statistics = None if scale is None else x.new_empty(*x.shape[:-1], 2)
-                x = _layer_forward(inputs, kind, own, activated, statistics)
-                saved += [inputs, activated if apart else x if scale is None else inputs, statistics]
-        ctx.save_for_backward(initial, start, *parameters, *saved)
-        return x, states
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad, grad_of_states):
-        initial, start, *rest = ctx.saved_tensors
-        parameters, saved = rest[:4 * len(ctx.kinds)], rest[4 * len(ctx.kinds):]
-        grads: list[Tensor | None] = [None] * len(parameters)
-        grad_initial = None
-        for index in reversed(range(len(ctx.kinds))):
-            kind, own = ctx.kinds[index], parameters[4 * index:4 * index + 4]
-            inputs, first, second = saved[3 * index:3 * index + 3]
-            if kind == 'gru' and grad_of_states is not None:
-                grad = grad_of_states if grad is None else grad + grad_of_states
-            if grad is None:
-                continue
-            grad, = _contiguous((grad,))
-            of_own = [None if part is None else torch.empty_like(part) for part in own]
-            of_inputs = torch.empty_like(inputs) if index or ctx.needs_input_grad[1] else None
-            I, O = inputs.shape[-1], grad.shape[-1]
-            if kind == 'gru':
-                grad_initial = torch.empty_like(initial) if ctx.needs_input_grad[2] else None
-                _call('gru_backward', (*inputs.shape[:2], I, O), inputs, initial, start, own[0], own[1], first, second,
-                      grad, of_inputs, grad_initial, *of_own)
-            else:
-                _call('layer_backward', (inputs.numel() // I, I, O, _ACTIVATIONS[kind]), inputs, own[0], own[2], first,
-                      second, grad, of_inputs, *of_own)
-            grads[4 * index:4 * index + 4] = of_own
-            grad = of_inputs
-        return None, grad, grad_initial, None, *grads
+def _steps(steps: Sequence[Step], gradients: dict[int, int]) -> ctypes.Array:
+    """`gradients`: by a parameter's address, that of its gradient."""
+    array = (_Step * len(steps))()
+    for entry, step in zip(array, steps):
+        entry.kind, entry.activation = _KINDS[step.kind], _ACTIVATIONS[step.activation]
+        entry.inputs, entry.outputs = step.inputs, step.outputs
+        for place, parameter in enumerate(step.parameters):
+            if parameter is not None:
+                address = parameter.data_ptr()
+                entry.parameters[place], entry.gradients[place] = address, gradients.get(address)
+    return array
 
 
-class _LookedUp(torch.autograd.Function):
-
-    @staticmethod
-    def forward(ctx, table, codes, shared, scale, shift):
-        table, codes, shared, scale, shift = _contiguous((table, codes, shared, scale, shift))
-        y = _looked_up_output(table, codes, shared)
-        activated, statistics = torch.empty_like(y), y.new_empty(*y.shape[:2], 2)
-        M, N, O = y.shape
-        _call('looked_up_forward', (M * N, N, O), codes, table, shared, scale, shift, activated, statistics, y)
-        ctx.table_rows = len(table)
-        ctx.save_for_backward(codes, scale, activated, statistics)
-        return y
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad):
-        codes, scale, activated, statistics = ctx.saved_tensors
-        M, N, O = grad.shape
-        grad_table, grad_shared = grad.new_empty(ctx.table_rows, O), grad.new_empty(M, O)
-        grad_scale, grad_shift = torch.empty_like(scale), torch.empty_like(scale)
-        _call('looked_up_backward', (M * N, N, O, ctx.table_rows), codes, scale, activated, statistics,
-              grad.contiguous(), grad_table, grad_shared, grad_scale, grad_shift)
-        return grad_table, None, grad_shared, grad_scale, grad_shift
+def _batch(steps: Sequence[Step], batch: Batch) -> tuple[list[Tensor | None], _Batch]:
+    """The batch for a kernel, and the tensors that must live until it has been called."""
+    kept = _contiguous((batch.inputs, batch.initial, batch.episode_start, batch.table, batch.codes))
+    L, C = batch.episode_start.shape
+    table_rows = 0 if batch.table is None else len(batch.table)
+    return kept, _Batch(L, C, batch.num_agents, batch.inputs.shape[2], table_rows, *(_address(x) for x in kept))
 
 
-def _tracked(*tensors: Tensor | None) -> bool:
-    return torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
+def _address(tensor: Tensor | None) -> int | None:
+    return None if tensor is None else tensor.data_ptr()
 
 
 def _contiguous(tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
     return [None if x is None else x.contiguous() for x in tensors]
 
 
-def _call(name: str, sizes: tuple[int, ...], *tensors: Tensor | None) -> None:
-    """Calls a kernel with the tensors' addresses; they must be contiguous."""
-    if getattr(library, name)(*sizes, *(None if x is None else x.data_ptr() for x in tensors)):
-        raise MemoryError(f'no memory for the scratch space of {name} at sizes {sizes}')
-
-
-def _gru_forward(x, initial, start, parameters, gates):
-    states = x.new_empty(*x.shape[:2], initial.shape[1])
-    _call('gru_forward', (*x.shape, initial.shape[1]), x, initial, start, *parameters, states, gates)
-    return states
-
-
-def _layer_forward(x, activation, parameters, activated, statistics):
-    I = x.shape[-1]
-    O = I if parameters[0] is None else len(parameters[0])
-    y = x.new_empty(*x.shape[:-1], O)
-    _call('layer_forward', (x.numel() // I, I, O, _ACTIVATIONS[activation]), x, *parameters, activated, statistics, y)
-    return y
-
-
-def _looked_up_output(table, codes, shared):
-    rows = len(shared)
-    return table.new_empty(rows, len(table) // max(rows, 1) if codes is None else codes.shape[1], table.shape[1])
+def _check(failed: int) -> None:
+    if failed:
+        raise MemoryError('no memory for the scratch space of a network')
 
 
 library = _load()

@@ -17,7 +17,7 @@ from dae_ros import draws
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.learning import advantages, losses
 from dae_ros.learning.chunks import first_states, shard_bounds, to_chunks
-from dae_ros.learning.networks import make_actor, make_critic, make_reward_network
+from dae_ros.learning.networks import Network, make_actor, make_critic, make_reward_network
 from dae_ros.learning.optimizer import FlatAdam
 from dae_ros.learning.parallel import Training, Workers
 from dae_ros.learning.policy import Policy, PolicyArchitecture
@@ -29,7 +29,8 @@ class Chunks(NamedTuple):
     """A rollout cut into C chunks of L steps; also one shard of it, with fewer chunks."""
 
     observations: Tensor   # [L, C, N, O]
-    states: Tensor         # [L, C, S]
+    states: Tensor         # [L, C, 1, S]
+    reward_inputs: Tensor  # [L, C, 1, I] what the reward networks read; the states at beta = 0
     episode_start: Tensor  # [L, C] bool
     actions: Tensor        # [L, C, N] int64
     log_probabilities: Tensor  # [L, C, N] of the actions taken, under the acting policy
@@ -44,8 +45,8 @@ class FirstStates(NamedTuple):
     """Recurrent state of every network before its first step of each chunk."""
 
     actor: Tensor          # [C, N, H]
-    critic: Tensor         # [C, H]
-    reward: list[Tensor]   # per member of the ensemble [C, N, H']; empty at beta = 0
+    critic: Tensor         # [C, 1, H]
+    reward: list[Tensor]   # per member of the ensemble [C, N or 1, H']; empty at beta = 0
 
 
 class Learner:
@@ -89,15 +90,17 @@ class Learner:
         values = self._value_norm.denormalize(normalized_values)
         next_values = values[1:] * continues
         next_values[truncated] = self._value_norm.denormalize(final_values)
-        actor_states = self._actor_states(observations, episode_start[:-1])
+        _, actor_states = self._forward(self._actor.network, self._spec.num_agents, observations, episode_start[:-1])
 
         # Line 19: advantages.
         team = advantages.generalized_advantages(rewards, values[:-1], next_values, continues, settings.gamma,
                                                  settings.gae_lambda)
         estimated = team.unsqueeze(-1).expand(actions.shape)
         reward_states: list[Tensor] = []
+        reward_inputs = states[:-1].unsqueeze(2)
         if settings.beta > 0:
-            predicted, reward_states = self._predicted_rewards(states[:-1], actions, episode_start[:-1])
+            reward_inputs = self._reward[0].network.inputs(states[:-1], actions, episode_start[:-1])
+            predicted, reward_states = self._predicted_rewards(reward_inputs, actions, episode_start[:-1])
             expected = advantages.expected_rewards(predicted, probabilities)
             estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
                                                                 settings.gae_lambda)
@@ -114,9 +117,9 @@ class Learner:
         chosen = probabilities.gather(-1, actions.unsqueeze(-1)).squeeze(-1).log()
         weights = torch.full_like(rewards, 1.0)
         cut = partial(to_chunks, length=L)
-        chunks = Chunks(cut(observations), cut(states[:-1]), cut(episode_start[:-1]), cut(actions), cut(chosen),
-                        cut(advantages.normalized(estimated)), cut(rewards), cut(normalized_values[:-1]),
-                        cut(self._value_norm.normalize(targets)), cut(weights))
+        chunks = Chunks(cut(observations), cut(states[:-1].unsqueeze(2)), cut(reward_inputs), cut(episode_start[:-1]),
+                        cut(actions), cut(chosen), cut(advantages.normalized(estimated)), cut(rewards),
+                        cut(normalized_values[:-1]), cut(self._value_norm.normalize(targets)), cut(weights))
         first = FirstStates(first_states(actor_states, L), first_states(critic_states[:-1], L),
                             [first_states(member, L) for member in reward_states])
 
@@ -152,102 +155,65 @@ class Learner:
 
     # Forward passes over whole sequences.
 
+    def _forward(self, network: Network, rows: int, inputs: Tensor, episode_start: Tensor, actions: Tensor | None = None):
+        """The network's outputs and recurrent states over a rollout [T, W, ...], `rows` of these in each world."""
+        @torch.no_grad()
+        def of_worlds(first: int, last: int) -> tuple[Tensor, Tensor]:
+            initial = inputs.new_zeros(last - first, rows, network.hidden_size)
+            own = None if actions is None else actions[:, first:last]
+            return network(inputs[:, first:last], initial, episode_start[:, first:last], own)
+
+        parts = self._workers.map(partial(of_worlds, *bounds) for bounds in shard_bounds(inputs.shape[1], rows))
+        return tuple(torch.cat(part, 1) for part in zip(*parts))
+
     def _values(self, states: Tensor, episode_start: Tensor, truncated: Tensor, final_states: Tensor):
-        """Normalised values [T + 1, W], the critic's recurrent states [T + 1, W, H], values [K] of the final states."""
+        """Normalised values [T + 1, W], the critic's recurrent states [T + 1, W, 1, H], values [K] of the final states."""
         critic = self._critic.network
-
-        def values(first: int, last: int) -> tuple[Tensor, Tensor]:
-            with torch.no_grad():
-                initial = states.new_zeros(last - first, self._settings.hidden_size)
-                outputs, hidden = critic(states[:, first:last], initial, episode_start[:, first:last])
-                return outputs.squeeze(-1), hidden
-
-        parts = self._workers.map(partial(values, *bounds) for bounds in shard_bounds(states.shape[1], 1))
-        outputs, hidden = (torch.cat(part, 1) for part in zip(*parts))
+        outputs, hidden = self._forward(critic, 1, states.unsqueeze(2), episode_start)
         with torch.no_grad():
             ongoing = torch.zeros(1, len(final_states), dtype=torch.bool)
-            final_values = critic(final_states.unsqueeze(0), hidden[:-1][truncated], ongoing)[0].view(-1)
-        return outputs, hidden, final_values
+            final_values = critic(final_states[None, :, None], hidden[:-1][truncated], ongoing)[0].view(-1)
+        return outputs.flatten(1), hidden, final_values
 
-    def _actor_states(self, observations: Tensor, episode_start: Tensor) -> Tensor:
-        """The actor's recurrent states [T, W, N, H], as the agents had them while acting."""
-        T, W, N, O = observations.shape
-
-        def states(first: int, last: int) -> Tensor:
-            with torch.no_grad():
-                rows = (last - first) * N
-                starts = episode_start[:, first:last].repeat_interleave(N, dim=1)
-                initial = observations.new_zeros(rows, self._settings.hidden_size)
-                return self._actor.network(observations[:, first:last].reshape(T, rows, O), initial, starts)[1]
-
-        parts = self._workers.map(partial(states, *bounds) for bounds in shard_bounds(W, N))
-        return torch.cat(parts, 1).view(T, W, N, -1)
-
-    def _predicted_rewards(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The ensemble's mean prediction [T, W, N, A] and each member's recurrent states [T, W, N, H']."""
-        T, W, N = actions.shape
-
-        def predict(network, first: int, last: int) -> tuple[Tensor, Tensor]:
-            with torch.no_grad():
-                initial = states.new_zeros((last - first) * N, self._reward_settings.hidden_size)
-                predicted, hidden = network(states[:, first:last], actions[:, first:last], initial,
-                                            episode_start[:, first:last])
-                return predicted, hidden.view(T, last - first, N, -1)
-
-        bounds = shard_bounds(W, N)
-        parts = self._workers.map(partial(predict, adam.network, *bound) for adam in self._reward for bound in bounds)
-        joined = []
-        for member in range(len(self._reward)):
-            of_member = parts[member * len(bounds):(member + 1) * len(bounds)]
-            joined.append([torch.cat(part, 1) for part in zip(*of_member)])
+    def _predicted_rewards(self, inputs: Tensor, actions: Tensor, episode_start: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The ensemble's mean prediction [T, W, N, A] and each member's recurrent states."""
+        members = [adam.network for adam in self._reward]
+        joined = [self._forward(member, member.states_per_world(), inputs, episode_start, actions) for member in members]
         return torch.stack([predicted for predicted, _ in joined]).mean(0), [hidden for _, hidden in joined]
 
     # Epochs. Each training yields the shards of one gradient step and is sent their gradients and loss terms.
 
     def _train_actor(self, chunks: Chunks, first: FirstStates, rollout: int) -> Training:
         settings, N = self._settings, self._spec.num_agents
-        names = ('policy/loss', 'policy/entropy', 'policy/clipped_fraction', 'policy/kl')
 
         def gradient(shard: Chunks, initial: Tensor) -> tuple[Tensor, Tensor]:
-            L, C, _, O = shard.observations.shape
-            logits, _ = self._actor.network(shard.observations.reshape(L, C * N, O), initial.reshape(C * N, -1),
-                                            shard.episode_start.repeat_interleave(N, dim=1))
-            log_probabilities = torch.log_softmax(logits, -1).view(L, C, N, -1)
-            log_ratio = log_probabilities.gather(-1, shard.actions.unsqueeze(-1)).squeeze(-1) - shard.log_probabilities
-            weights = (shard.weights / N).unsqueeze(-1).expand_as(log_ratio)
-            loss = losses.policy_loss(log_ratio, shard.advantages, weights, settings.clip)
-            entropy = losses.entropy_bonus(log_probabilities, weights)
-            flat = self._actor.gradient(loss - settings.entropy_coefficient * entropy)
-            with torch.no_grad():
-                clipped = ((log_ratio.exp() - 1).abs() > settings.clip).float()
-                return flat, torch.stack([loss, entropy, (clipped * weights).sum(), -(log_ratio * weights).sum()]).detach()
+            loss = losses.PolicyLoss(shard.actions, shard.log_probabilities, shard.advantages, shard.weights / N, settings.clip,
+                                     settings.entropy_coefficient)
+            return self._actor.network.gradient(loss, shard.observations, initial, shard.episode_start)
 
-        return (yield from self._epochs('actor', self._actor, gradient, chunks, first.actor, N, settings.epochs, rollout, names))
+        return (yield from self._epochs('actor', self._actor, gradient, chunks, first.actor, N, settings.epochs, rollout,
+                                        losses.PolicyLoss.sums))
 
     def _train_critic(self, chunks: Chunks, first: FirstStates, rollout: int) -> Training:
         settings = self._settings
 
         def gradient(shard: Chunks, initial: Tensor) -> tuple[Tensor, Tensor]:
-            values, _ = self._critic.network(shard.states, initial, shard.episode_start)
-            loss = losses.value_loss(values.squeeze(-1), shard.values, shard.targets, shard.weights, settings.clip,
-                                     settings.huber_delta)
-            return self._critic.gradient(settings.value_coefficient * loss), loss.detach().view(1)
+            loss = losses.ValueLoss(shard.values, shard.targets, shard.weights, settings.clip, settings.huber_delta,
+                                    settings.value_coefficient)
+            return self._critic.network.gradient(loss, shard.states, initial, shard.episode_start)
 
         return (yield from self._epochs('critic', self._critic, gradient, chunks, first.critic, 1, settings.epochs, rollout,
-                                        ('value/loss',)))
+                                        losses.ValueLoss.sums))
 
     def _train_reward(self, member: int, chunks: Chunks, first: FirstStates, rollout: int) -> Training:
         adam, N = self._reward[member], self._spec.num_agents
 
         def gradient(shard: Chunks, initial: Tensor) -> tuple[Tensor, Tensor]:
-            predicted, _ = adam.network(shard.states, shard.actions, initial.reshape(-1, initial.shape[-1]),
-                                        shard.episode_start)
-            loss = losses.reward_loss(predicted, shard.actions, shard.rewards.unsqueeze(-1),
-                                      (shard.weights / N).unsqueeze(-1))
-            return adam.gradient(loss), loss.detach().view(1)
+            loss = losses.RewardLoss(shard.actions, shard.rewards, shard.weights / N)
+            return adam.network.gradient(loss, shard.reward_inputs, initial, shard.episode_start, shard.actions)
 
         return (yield from self._epochs(f'reward_network.{member}', adam, gradient, chunks, first.reward[member], N,
-                                        self._reward_settings.epochs, rollout, ('reward_network/loss',)))
+                                        self._reward_settings.epochs, rollout, losses.RewardLoss.sums))
 
     def _epochs(self, name: str, adam: FlatAdam, gradient, chunks: Chunks, initial: Tensor, rows_per_chunk: int, epochs: int,
                 rollout: int, metric_names: tuple[str, ...]) -> Training:

@@ -1,37 +1,93 @@
-"""The three losses as sums over weighted rows, so that shards of a batch add up to the batch."""
+"""The three losses as sums over weighted rows, so that shards of a batch add up to the batch.
+
+Each is a function of a network's outputs [L, C, rows, K] that gives what is to be differentiated and sums worth showing,
+and knows its terms for the compiled kernels, which compute the same.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple, Union
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-
-def policy_loss(log_ratio: Tensor, advantages: Tensor, weights: Tensor, clip: float) -> Tensor:
-    """Clipped surrogate (eq. 4), negated: all tensors of one shape, log_ratio = log pi - log pi_old."""
-    ratio = log_ratio.exp()
-    surrogate = torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
-    return -(surrogate * weights).sum()
+from dae_ros.learning.kernels import LossTerms
 
 
-def entropy_bonus(log_probabilities: Tensor, weights: Tensor) -> Tensor:
-    """Entropy of pi over the last axis, summed with `weights` of the leading axes."""
-    entropy = -(log_probabilities.exp() * log_probabilities).sum(-1)
-    return (entropy * weights).sum()
+class PolicyLoss(NamedTuple):
+    """The clipped surrogate (eq. 4), negated, less the entropy bonus; on logits [L, C, N, A]."""
+
+    actions: Tensor                # [L, C, N] int64
+    old_log_probabilities: Tensor  # [L, C, N] of the actions under the acting policy
+    advantages: Tensor             # [L, C, N]
+    weights: Tensor                # [L, C] of each agent of a column
+    clip: float
+    entropy_coefficient: float
+
+    sums = ('policy/loss', 'policy/entropy', 'policy/clipped_fraction', 'policy/kl')
+
+    def __call__(self, logits: Tensor) -> tuple[Tensor, Tensor]:
+        log_probabilities = torch.log_softmax(logits, -1)
+        log_ratio = log_probabilities.gather(-1, self.actions.unsqueeze(-1)).squeeze(-1) - self.old_log_probabilities
+        ratio = log_ratio.exp()
+        surrogate = torch.minimum(ratio * self.advantages, ratio.clamp(1 - self.clip, 1 + self.clip) * self.advantages)
+        entropy = -(log_probabilities.exp() * log_probabilities).sum(-1)
+        clipped = ((ratio - 1).abs() > self.clip).to(ratio.dtype)
+        parts = torch.stack([-surrogate, entropy, clipped, -log_ratio])
+        sums = (parts * self.weights.unsqueeze(-1)).sum((1, 2, 3))
+        return sums[0] - self.entropy_coefficient * sums[1], sums.detach()
+
+    @property
+    def terms(self) -> LossTerms:
+        return LossTerms('policy', (self.clip, self.entropy_coefficient), self.actions,
+                         (self.old_log_probabilities, self.advantages), self.weights)
 
 
-def value_loss(values: Tensor, old_values: Tensor, targets: Tensor, weights: Tensor, clip: float, delta: float) -> Tensor:
-    """Clipped value loss (eq. 40) with Huber errors, on normalised values: the worse of moving freely and within `clip`."""
-    clipped = old_values + (values - old_values).clamp(-clip, clip)
-    errors = torch.maximum(functional.huber_loss(values, targets, reduction='none', delta=delta),
-                           functional.huber_loss(clipped, targets, reduction='none', delta=delta))
-    return (errors * weights).sum()
+class ValueLoss(NamedTuple):
+    """The clipped value loss (eq. 40) with Huber errors, on normalised values [L, C, 1, 1]: the worse of moving freely
+    and within `clip`. Differentiated times `coefficient`."""
+
+    old_values: Tensor  # [L, C]
+    targets: Tensor     # [L, C]
+    weights: Tensor     # [L, C]
+    clip: float
+    delta: float
+    coefficient: float
+
+    sums = ('value/loss',)
+
+    def __call__(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        values = values.flatten(1)
+        held = self.old_values + (values - self.old_values).clamp(-self.clip, self.clip)
+        errors = torch.maximum(functional.huber_loss(values, self.targets, reduction='none', delta=self.delta),
+                               functional.huber_loss(held, self.targets, reduction='none', delta=self.delta))
+        loss = (errors * self.weights).sum()
+        return self.coefficient * loss, loss.detach().view(1)
+
+    @property
+    def terms(self) -> LossTerms:
+        return LossTerms('value', (self.clip, self.delta, self.coefficient), None, (self.old_values, self.targets),
+                         self.weights)
 
 
-def reward_loss(predicted: Tensor, actions: Tensor, rewards: Tensor, weights: Tensor) -> Tensor:
-    """Half the squared error of the predicted reward of the action taken (eq. 19).
+class RewardLoss(NamedTuple):
+    """Half the squared error of the predicted reward of the action taken (eq. 19), on predictions [L, C, N, A]."""
 
-    predicted: [..., A]. actions: [...] int64. rewards, weights: broadcast to [...].
-    """
-    taken = predicted.gather(-1, actions.unsqueeze(-1)).squeeze(-1)
-    return ((taken - rewards).square() * weights).sum() / 2
+    actions: Tensor  # [L, C, N] int64
+    rewards: Tensor  # [L, C]
+    weights: Tensor  # [L, C] of each agent of a column
+
+    sums = ('reward_network/loss',)
+
+    def __call__(self, predicted: Tensor) -> tuple[Tensor, Tensor]:
+        taken = predicted.gather(-1, self.actions.unsqueeze(-1)).squeeze(-1)
+        loss = ((taken - self.rewards.unsqueeze(-1)).square() * self.weights.unsqueeze(-1)).sum() / 2
+        return loss, loss.detach().view(1)
+
+    @property
+    def terms(self) -> LossTerms:
+        return LossTerms('reward', (), self.actions, (self.rewards,), self.weights)
+
+
+Loss = Union[PolicyLoss, ValueLoss, RewardLoss]

@@ -1,14 +1,15 @@
-"""Actor, critic and reward network in torch, with the paper's layers and initialisation.
+"""Actor, critic and reward networks, with the paper's layers and initialisation.
 
-Every network reads sequences: the leading axis is time, and the recurrent state is zeroed where an episode starts. The
-rows of a sequence are worlds, or worlds times agents.
+A network is a row of steps (`kernels.Step`), which the compiled kernels and torch both know how to take; torch is the
+reference and the fallback. Batches are sequences of L steps: C columns, which are worlds or pieces of their history, of N
+agents each. Recurrent states are zeroed where an episode starts.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from typing import Sequence
+from typing import Iterable
 
 import torch
 from torch import Tensor, nn
@@ -18,33 +19,13 @@ from dae_ros import draws
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.learning import kernels
 from dae_ros.learning.gru import gru_sequence
-from dae_ros.learning.kernels import Step
+from dae_ros.learning.kernels import Batch, Step
+from dae_ros.learning.losses import Loss
 from dae_ros.types import WorldSpec
 
 _ACTIVATIONS = {'identity': lambda x: x, 'relu': torch.relu, 'tanh': torch.tanh}
 _GAINS = {'relu': math.sqrt(2), 'tanh': 5 / 3}
 _LOOK_UP_BELOW = 0.5  # largest table of everything the others can do, relative to the batch
-
-
-def layer(linear: nn.Linear | None = None, activation: str = 'identity', norm: nn.LayerNorm | None = None) -> Step:
-    """norm(activation(linear(x))); what is None is left out."""
-    parameters = (None, None) if linear is None else (linear.weight, linear.bias)
-    return Step(activation, parameters + ((None, None) if norm is None else (norm.weight, norm.bias)))
-
-
-def run(steps: Sequence[Step], x: Tensor, initial: Tensor | None = None,
-        episode_start: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-    """`kernels.chain` by the fastest means there are; arguments and result as there."""
-    if kernels.usable(x, *(part for step in steps for part in step.parameters if part is not None)):
-        return kernels.chain(steps, x, initial, episode_start)
-    states = None
-    for kind, (first, second, third, fourth) in steps:
-        if kind == 'gru':
-            x = states = gru_sequence(x, initial, episode_start, first, second, third, fourth)
-        else:
-            x = _ACTIVATIONS[kind](x if first is None else functional.linear(x, first, second))
-            x = x if third is None else functional.layer_norm(x, third.shape, third, fourth)
-    return x, states
 
 
 class Gru(nn.Module):
@@ -57,15 +38,106 @@ class Gru(nn.Module):
         self.bias_ih = nn.Parameter(torch.empty(3 * hidden_size))
         self.bias_hh = nn.Parameter(torch.empty(3 * hidden_size))
 
-    def step(self) -> Step:
-        return Step('gru', (self.weight_ih, self.weight_hh, self.bias_ih, self.bias_hh))
+
+def layer(linear: nn.Linear | None = None, activation: str = 'identity', norm: nn.LayerNorm | None = None) -> Step:
+    """norm(activation(linear(x))); what is None is left out."""
+    inputs, outputs = norm.normalized_shape * 2 if linear is None else (linear.in_features, linear.out_features)
+    parameters = (None, None) if linear is None else (linear.weight, linear.bias)
+    return Step('layer', activation, inputs, outputs, parameters + ((None, None) if norm is None else (norm.weight, norm.bias)))
 
 
-class RecurrentNetwork(nn.Module):
+def gru(module: Gru) -> Step:
+    """The states of a GRU."""
+    return Step('gru', 'identity', module.weight_ih.shape[1], module.weight_hh.shape[1],
+                (module.weight_ih, module.weight_hh, module.bias_ih, module.bias_hh))
+
+
+def fan_out(norm: nn.LayerNorm) -> Step:
+    """norm(relu(table[code] + x)): what every agent sees of its column and of the others' actions."""
+    width, = norm.normalized_shape
+    return Step('fan_out', 'relu', width, width, (None, None, norm.weight, norm.bias))
+
+
+def run_in_torch(steps: Iterable[Step], batch: Batch) -> tuple[Tensor, Tensor | None]:
+    """What `kernels.forward` computes, by torch's own differentiable operations."""
+    x, states = batch.inputs, None
+    for step in steps:
+        first, second, third, fourth = step.parameters
+        if step.kind == 'gru':
+            L, C, rows, _ = x.shape
+            starts = batch.episode_start.repeat_interleave(rows, dim=1)
+            x = gru_sequence(x.flatten(1, 2), batch.initial.flatten(0, 1), starts, first, second, third, fourth)
+            x = states = x.view(L, C, rows, step.outputs)
+            continue
+        if step.kind == 'fan_out':
+            table = batch.table
+            own = batch.codes is None
+            chosen = table.view(*x.shape[:2], batch.num_agents, -1) if own else functional.embedding(batch.codes, table)
+            x = chosen + x
+        x = _ACTIVATIONS[step.activation](x if first is None else functional.linear(x, first, second))
+        x = x if third is None else functional.layer_norm(x, third.shape, third, fourth)
+    return x, states
+
+
+class Network(nn.Module):
+    """What all networks share: outputs, and the gradient of a loss of them."""
+
+    hidden_size: int  # of the recurrent state
+
+    def steps(self) -> list[Step]:
+        """The network."""
+        raise NotImplementedError
+
+    def table_parameters(self) -> tuple[Tensor, ...]:
+        """The parameters `_table` depends on; they are the network's first."""
+        return ()
+
+    def _table(self, actions: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        """What a fan-out adds, and which row of it each agent has: `Batch.table` and `Batch.codes`."""
+        return None, None
+
+    def forward(self, inputs: Tensor, initial: Tensor, episode_start: Tensor,
+                actions: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Outputs [L, C, rows, K] and recurrent states [L, C, rows at the GRU, H] after each step.
+
+        inputs: [L, C, N or 1, I]. initial: [C, rows at the GRU, H]. episode_start: [L, C] bool. actions: [L, C, N] int64,
+        for networks that see them. With gradients enabled this is torch; see `gradient`.
+        """
+        batch = Batch(inputs, initial, episode_start, _agents(inputs, actions), *self._table(actions))
+        if kernels.usable(inputs) and not torch.is_grad_enabled():
+            return kernels.forward(self.steps(), batch)
+        return run_in_torch(self.steps(), batch)
+
+    def gradient(self, loss: Loss, inputs: Tensor, initial: Tensor, episode_start: Tensor,
+                 actions: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """d loss / d parameters as one flat vector, and the sums of the loss; the rest as for `forward`.
+
+        Leaves no trace on the parameters, so that threads may share the network.
+        """
+        parameters = tuple(self.parameters())
+        with torch.enable_grad():
+            table, codes = self._table(actions)
+            batch = Batch(inputs, initial, episode_start, _agents(inputs, actions), table, codes)
+            if not kernels.usable(inputs):
+                objective, sums = loss(run_in_torch(self.steps(), batch)[0])
+                return torch.cat([part.reshape(-1) for part in torch.autograd.grad(objective, parameters)]), sums
+        flat, grad_table, sums = kernels.gradient(self.steps(), parameters, batch, loss.terms)
+        if table is not None:
+            parts = [part.reshape(-1) for part in torch.autograd.grad(table, self.table_parameters(), grad_table)]
+            torch.cat(parts, out=flat[:sum(map(len, parts))])
+        return flat, sums[:len(loss.sums)]
+
+
+def _agents(inputs: Tensor, actions: Tensor | None) -> int:
+    return inputs.shape[2] if actions is None else actions.shape[2]
+
+
+class RecurrentNetwork(Network):
     """LayerNorm, MLP, GRU, LayerNorm, linear head: actor (A outputs) and critic (one output)."""
 
     def __init__(self, input_size: int, output_size: int, hidden_size: int, mlp_layers: int, activation: str):
         super().__init__()
+        self.hidden_size = hidden_size
         self._activation = activation
         self.input_norm = nn.LayerNorm(input_size)
         sizes = [input_size] + [hidden_size] * mlp_layers
@@ -75,11 +147,9 @@ class RecurrentNetwork(nn.Module):
         self.gru_norm = nn.LayerNorm(hidden_size)
         self.head = nn.Linear(hidden_size, output_size)
 
-    def forward(self, inputs: Tensor, initial: Tensor, episode_start: Tensor) -> tuple[Tensor, Tensor]:
-        """inputs [L, R, I], initial [R, H], episode_start [L, R] bool -> outputs [L, R, K], states [L, R, H]."""
+    def steps(self) -> list[Step]:
         layers = [layer(linear, self._activation, norm) for linear, norm in zip(self.mlp, self.mlp_norm)]
-        steps = [layer(norm=self.input_norm), *layers, self.gru.step(), layer(norm=self.gru_norm), layer(self.head)]
-        return run(steps, inputs, initial, episode_start)
+        return [layer(norm=self.input_norm), *layers, gru(self.gru), layer(norm=self.gru_norm), layer(self.head)]
 
 
 @functools.lru_cache(maxsize=8)
@@ -97,60 +167,104 @@ def _joint_actions_of_others(num_agents: int, num_actions: int, device: torch.de
     return torch.cat(blocks), torch.stack(place), torch.arange(N, device=device) * len(digits)
 
 
-class PerAgentRewardNetwork(nn.Module):
-    """The paper's reward network (section 3.3): r_psi(s, a_-i, .) for every action of agent i, recurrent over a_-i.
+class RewardNetwork(Network):
+    """r_psi(s, a_-i, .): for every agent the shared reward for each action of its own (paper, section 3.3).
 
-    The zeroed block of agent i's own action is the only thing that tells the agents apart, so what depends on the state
-    alone is computed once per world, and what depends on the others' actions alone once for all they can do, where that
-    is less than the batch (75 rows for three agents with five actions).
+    The zeroed block of agent i's own action is the only thing that tells the agents apart, so what depends on the others'
+    actions alone is computed once for all they can do, where that is less than the batch (75 rows for three agents with
+    five actions).
     """
 
     def __init__(self, spec: WorldSpec, hidden_size: int):
         super().__init__()
+        self.hidden_size = hidden_size
         self.num_agents, self.num_actions = spec.num_agents, spec.num_actions
         self.action_embedding = nn.Parameter(torch.empty(spec.num_agents * spec.num_actions, hidden_size))
         self.action_bias = nn.Parameter(torch.empty(hidden_size))
+        self.joint_action = nn.Linear(hidden_size, hidden_size)
+
+    def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
+        """What the network reads of a rollout [T, W, 1, I]: states [T, W, S], actions [T, W, N], episode_start [T, W]."""
+        raise NotImplementedError
+
+    def states_per_world(self) -> int:
+        """Recurrent states per world: N or 1."""
+        raise NotImplementedError
+
+    def table_parameters(self) -> tuple[Tensor, ...]:
+        return self.action_embedding, self.action_bias, self.joint_action.weight, self.joint_action.bias
+
+    def _table(self, actions: Tensor) -> tuple[Tensor, Tensor | None]:
+        """joint_action(relu(embedding of the others' actions)) for actions [L, C, N]."""
+        N, A = self.num_agents, self.num_actions
+        codes = None
+        if N * A ** (N - 1) <= _LOOK_UP_BELOW * actions.numel():
+            hot, place, first = _joint_actions_of_others(N, A, actions.device)
+            others = hot.to(self.action_bias.dtype) @ self.action_embedding
+            codes = (actions.unsqueeze(-2) * place).sum(-1) + first
+        else:
+            embedded = functional.embedding(actions + torch.arange(N, device=actions.device) * A, self.action_embedding)
+            others = (embedded.sum(-2, keepdim=True) - embedded).flatten(0, 2)
+        return self.joint_action(torch.relu(others + self.action_bias)), codes
+
+
+class PerAgentRewardNetwork(RewardNetwork):
+    """The paper's: recurrent over the state and a_-i, one sequence per agent."""
+
+    def __init__(self, spec: WorldSpec, hidden_size: int):
+        super().__init__(spec, hidden_size)
         self.state = nn.Linear(spec.state_size, hidden_size)
         self.state_norm = nn.LayerNorm(hidden_size)
-        self.joint_action = nn.Linear(hidden_size, hidden_size)
         self.joint_state = nn.Linear(hidden_size, hidden_size, bias=False)
         self.joint_norm = nn.LayerNorm(hidden_size)
         self.gru = Gru(hidden_size, hidden_size)
         self.gru_norm = nn.LayerNorm(hidden_size)
         self.head = nn.Linear(hidden_size, spec.num_actions)
 
-    def forward(self, state: Tensor, actions: Tensor, initial: Tensor, episode_start: Tensor) -> tuple[Tensor, Tensor]:
-        """state [L, C, S], actions [L, C, N] int64, initial [C * N, H], episode_start [L, C] bool
-        -> predicted rewards [L, C, N, A] for every own action, states [L, C * N, H]."""
-        L, C, N = actions.shape
-        seen, _ = run([layer(self.state, 'relu', self.state_norm), layer(self.joint_state)], state)
-        others, codes = self._others(actions.flatten(0, 1))
-        joint = self._joint(run([layer(self.joint_action)], others)[0], codes, seen.flatten(0, 1))
-        steps = [self.gru.step(), layer(norm=self.gru_norm), layer(self.head)]
-        starts = episode_start.repeat_interleave(N, dim=1)
-        predicted, states = run(steps, joint.view(L, C * N, joint.shape[-1]), initial, starts)
-        return predicted.view(L, C, N, self.num_actions), states
+    def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
+        return states.unsqueeze(2)
 
-    def _others(self, actions: Tensor) -> tuple[Tensor, Tensor | None]:
-        """First layer over the others' actions [M, N]: rows [K, H], and which of them each agent has [M, N]; None if
-        each has a row of its own, in order (K = M N)."""
-        N, A = self.num_agents, self.num_actions
-        if N * A ** (N - 1) <= _LOOK_UP_BELOW * actions.numel():
-            hot, place, first = _joint_actions_of_others(N, A, actions.device)
-            weights = self.action_embedding.t()
-            rows, _ = run([Step('relu', (weights, self.action_bias, None, None))], hot.to(weights.dtype))
-            return rows, (actions.unsqueeze(1) * place).sum(-1) + first
-        embedded = functional.embedding(actions + torch.arange(N, device=actions.device) * A, self.action_embedding)
-        return torch.relu(embedded.sum(1, keepdim=True) - embedded + self.action_bias).flatten(0, 1), None
+    def states_per_world(self) -> int:
+        return self.num_agents
 
-    def _joint(self, table: Tensor, codes: Tensor | None, seen: Tensor) -> Tensor:
-        """norm(relu(table[codes] + seen)): [M, N, H] for seen [M, H]."""
-        norm = self.joint_norm
-        if kernels.usable(table, seen, norm.weight):
-            return kernels.looked_up(table, codes, seen, norm.weight, norm.bias)
-        own = codes is None
-        chosen = table.view(len(seen), self.num_agents, table.shape[-1]) if own else functional.embedding(codes, table)
-        return norm(torch.relu(chosen + seen.unsqueeze(1)))
+    def steps(self) -> list[Step]:
+        return [layer(self.state, 'relu', self.state_norm), layer(self.joint_state), fan_out(self.joint_norm),
+                gru(self.gru), layer(norm=self.gru_norm), layer(self.head)]
+
+
+class SharedTrunkRewardNetwork(RewardNetwork):
+    """One recurrent pass per world over states and all agents' earlier actions, then a small head per agent.
+
+    It sees more than the paper's, which never shows an agent its own earlier actions, and costs about a third at N = 3.
+    """
+
+    def __init__(self, spec: WorldSpec, hidden_size: int):
+        super().__init__(spec, hidden_size)
+        self.trunk = nn.Linear(spec.state_size + spec.num_agents * spec.num_actions, hidden_size)
+        self.trunk_norm = nn.LayerNorm(hidden_size)
+        self.gru = Gru(hidden_size, hidden_size)
+        self.gru_norm = nn.LayerNorm(hidden_size)
+        self.joint_state = nn.Linear(hidden_size, hidden_size, bias=False)
+        self.joint_norm = nn.LayerNorm(hidden_size)
+        self.hidden = nn.Linear(hidden_size, hidden_size)
+        self.hidden_norm = nn.LayerNorm(hidden_size)
+        self.head = nn.Linear(hidden_size, spec.num_actions)
+
+    def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
+        taken = functional.one_hot(actions, self.num_actions).flatten(2).to(states.dtype)
+        before = torch.cat([torch.zeros_like(taken[:1]), taken[:-1]]) * ~episode_start.unsqueeze(-1)
+        return torch.cat([states, before], -1).unsqueeze(2)
+
+    def states_per_world(self) -> int:
+        return 1
+
+    def steps(self) -> list[Step]:
+        return [layer(self.trunk, 'relu', self.trunk_norm), gru(self.gru), layer(norm=self.gru_norm),
+                layer(self.joint_state), fan_out(self.joint_norm), layer(self.hidden, 'relu', self.hidden_norm),
+                layer(self.head)]
+
+
+REWARD_NETWORKS = {'per_agent': PerAgentRewardNetwork, 'shared_trunk': SharedTrunkRewardNetwork}
 
 
 def make_actor(spec: WorldSpec, settings: LearnerSettings, seed: int) -> RecurrentNetwork:
@@ -166,10 +280,9 @@ def make_critic(spec: WorldSpec, settings: LearnerSettings, seed: int) -> Recurr
     return _initialise(critic, _GAINS[settings.activation], 1.0, seed, 'critic')
 
 
-def make_reward_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int,
-                        member: int) -> PerAgentRewardNetwork:
+def make_reward_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int, member: int) -> RewardNetwork:
     """Member `member` of the reward ensemble (algorithm 1, line 14)."""
-    network = PerAgentRewardNetwork(spec, settings.hidden_size)
+    network = REWARD_NETWORKS[settings.architecture](spec, settings.hidden_size)
     return _initialise(network, _GAINS['relu'], 1.0, seed, f'reward_network.{member}')
 
 

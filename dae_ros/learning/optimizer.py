@@ -13,22 +13,17 @@ class FlatAdam:
 
     def __init__(self, network: nn.Module, learning_rate: float, epsilon: float, max_gradient_norm: float):
         self.network = network
-        self.parameters = tuple(network.parameters())
         self._max_gradient_norm = max_gradient_norm
-        self._flat = torch.cat([parameter.detach().reshape(-1) for parameter in self.parameters])
+        parameters = tuple(network.parameters())
+        self._flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
         offset = 0
-        for parameter in self.parameters:
+        for parameter in parameters:
             parameter.data = self._flat[offset:offset + parameter.numel()].view_as(parameter)
             offset += parameter.numel()
         self._optimizer = torch.optim.Adam([self._flat], lr=learning_rate, eps=epsilon, fused=True)
         # Adam makes its moments at the first step; they are made here so that a checkpoint always has the same tensors.
         self._optimizer.state[self._flat] = {'step': torch.zeros(()), 'exp_avg': torch.zeros_like(self._flat),
                                              'exp_avg_sq': torch.zeros_like(self._flat)}
-
-    def gradient(self, loss: Tensor) -> Tensor:
-        """d loss / d parameters as one flat vector. Leaves no trace on the parameters, so threads may share the network."""
-        gradients = torch.autograd.grad(loss, self.parameters)
-        return torch.cat([gradient.reshape(-1) for gradient in gradients])
 
     def step(self, gradient: Tensor) -> float:
         """One step along `gradient`, shortened to the largest allowed norm. Returns the norm before that."""

@@ -31,7 +31,7 @@ def build(target: Path) -> None:
     compiler = _compiler()
     tuning = '-march=native' if platform.machine() in ('x86_64', 'AMD64', 'i686') else '-mcpu=native'
     temporary = target.with_name(f'.{target.name}.{os.getpid()}')
-    command = [*compiler, *_FLAGS, tuning, str(SOURCE), '-o', str(temporary)]
+    command = [*compiler, *_FLAGS, tuning, str(SOURCE), '-o', str(temporary), '-lm']
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL)
         if result.returncode:

@@ -1,13 +1,17 @@
-/* The learner's layers on one core: GRU over a sequence and [linear, activation, LayerNorm], forward and backward.
+/* The learner's networks on one core: what they give for a batch of sequences, and the gradient of a loss of it.
  *
  * Plain C with the vector extensions of GCC and clang. All matrices are row-major float32 and may lie at any address.
  * A result's bits depend on the numbers that went in alone: every sum runs in one fixed order, whatever the alignment,
  * the row's place in a block or the thread.
  *
+ * A batch goes through its network in blocks of a few columns, forward, loss and backward, so that what the backward
+ * pass needs of the forward pass is still in the cache.
+ *
  * Products run on register tiles of ROWS x COLUMNS. Their right operand is packed once per call into panels of COLUMNS
  * columns, zero-padded; a panel's block of DEPTH rows stays in the first-level cache while the rows pass by it.
  */
 
+#include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -18,7 +22,15 @@
 #include <immintrin.h>
 #endif
 
-enum { LANES = 8, ROWS = 6, COLUMNS = 2 * LANES, DEPTH = 256, BLOCK = 48 };
+#ifndef LANES
+#if defined(__AVX512F__)
+#define LANES 16
+#else
+#define LANES 8
+#endif
+#endif
+
+enum { ROWS = 6, COLUMNS = 2 * LANES, DEPTH = 4096 / COLUMNS, BLOCK = 48 };
 enum { IDENTITY = 0, RELU = 1, TANH = 2 };
 
 typedef float vec __attribute__((vector_size(LANES * 4)));
@@ -31,13 +43,15 @@ INLINE vec load(const float *p) { return *(const unaligned_vec *)p; }
 
 INLINE void store(float *p, vec v) { *(unaligned_vec *)p = v; }
 
-INLINE vec all(float x) { return (vec){x, x, x, x, x, x, x, x}; }
+INLINE vec all(float x) { return x - (vec){0}; }
 
 /* The first n floats at p, then zeros; n may exceed LANES. */
 INLINE vec load_upto(const float *p, long n) {
     if (n >= LANES)
         return load(p);
-#if defined(__AVX2__)
+#if defined(__AVX512F__) && LANES == 16
+    return _mm512_maskz_loadu_ps((__mmask16)((1u << n) - 1), p);
+#elif defined(__AVX2__) && LANES == 8
     const __m256i lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
     return _mm256_maskload_ps(p, _mm256_cmpgt_epi32(_mm256_set1_epi32((int)n), lane));
 #else
@@ -72,7 +86,15 @@ INLINE void store_upto(float *p, vec v, long n) {
 
 INLINE void add_to(float *p, vec v, long n) { store_upto(p, load_upto(p, n) + v, n); }
 
-INLINE float sum_of(vec v) { return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7])); }
+INLINE float sum_of(vec v) {
+#if LANES == 16
+#define PAIR(i) (v[i] + v[i + 8])
+#else
+#define PAIR(i) v[i]
+#endif
+    return ((PAIR(0) + PAIR(4)) + (PAIR(2) + PAIR(6))) + ((PAIR(1) + PAIR(5)) + (PAIR(3) + PAIR(7)));
+#undef PAIR
+}
 
 INLINE vec choose(ivec condition, vec yes, vec no) {
     return (vec)((condition & (ivec)yes) | (~condition & (ivec)no));
@@ -80,7 +102,9 @@ INLINE vec choose(ivec condition, vec yes, vec no) {
 
 /* A NaN stays one. */
 INLINE vec clamp(vec x, float limit) {
-#if defined(__AVX__)
+#if defined(__AVX512F__) && LANES == 16
+    return _mm512_max_ps(all(-limit), _mm512_min_ps(all(limit), x));
+#elif defined(__AVX__) && LANES == 8
     return _mm256_max_ps(all(-limit), _mm256_min_ps(all(limit), x));
 #else
     x = choose(x > all(limit), all(limit), x);
@@ -97,17 +121,19 @@ INLINE vec reduce(vec y, ivec *power) {
     return y - k * all(0.693359375f) + k * all(2.12194440e-4f);
 }
 
-/* To 1e-7 relative; e^-x by its Chebyshev polynomial of degree 5. */
-INLINE vec sigmoid_of(vec x) {
+/* To 1e-7 relative, by the Chebyshev polynomial of degree 5; x is held within -87 .. 87. */
+INLINE vec exp_of(vec x) {
     ivec power;
-    vec f = reduce(clamp(-x, 87), &power);
+    vec f = reduce(clamp(x, 87), &power);
     vec e = f * all(0.008296807f) + all(0.04194099f);
     e = e * f + all(0.16667749f);
     e = e * f + all(0.4999862f);
     e = e * f + all(0.9999996f);
     e = e * f + all(1.0000001f);
-    return all(1) / (all(1) + (vec)((ivec)e + power));
+    return (vec)((ivec)e + power);
 }
+
+INLINE vec sigmoid_of(vec x) { return all(1) / (all(1) + exp_of(-x)); }
 
 /* To 1e-7 relative, near zero too: (e^2x - 1) / (e^2x + 1), with e^2x - 1 = 2^k (e^f - 1) + (2^k - 1). */
 INLINE vec tanh_of(vec x) {
@@ -161,6 +187,8 @@ void keep_freed_memory(void) {
 
 static long min(long a, long b) { return a < b ? a : b; }
 
+static long max(long a, long b) { return a > b ? a : b; }
+
 static long round_up(long n, long multiple) { return (n + multiple - 1) / multiple * multiple; }
 
 /* One allocation per call, handed out piece by piece; `measure` first adds up what the pieces need. */
@@ -174,6 +202,8 @@ static float *take(Arena *arena, long floats) {
     arena->used += (size_t)round_up(floats * 4, 64);
     return piece;
 }
+
+static void *take_bytes(Arena *arena, long bytes) { return take(arena, (bytes + 3) / 4); }
 
 static int begin_arena(Arena *arena) {
     arena->base = aligned_alloc(64, arena->used ? arena->used : 64);
@@ -338,6 +368,57 @@ static void add_outer(long M, long N, long K, const float *left, const float *ri
     }
 }
 
+/* Networks. */
+
+enum { LAYER = 0, GRU = 1, FAN_OUT = 2 };
+enum { MOST_STEPS = 16 };
+
+/* What a network does one after another:
+ *   LAYER    y = LayerNorm(activation(x weight^T + bias)); parameters weight [O, I], bias [O], scale and shift [O] of the
+ *            LayerNorm, of which each pair may be NULL, and the bias.
+ *   GRU      y = the states after each step; parameters weight_ih [3 O, I], weight_hh [3 O, O], bias_ih and bias_hh
+ *            [3 O] in the order reset, update, candidate.
+ *   FAN_OUT  y = LayerNorm(relu(table[code] + x)), a row per agent from a row per column; scale and shift in places 2, 3.
+ * To `gradients`, of the parameters' shapes, what a batch contributes is added. */
+typedef struct {
+    long kind, activation, inputs, outputs;
+    const float *parameters[4];
+    float *gradients[4];
+} Step;
+
+/* L steps of C columns, which are worlds or pieces of their history, of N agents each. */
+typedef struct {
+    long length, columns, agents;
+    long rows;            /* of a column where the network begins: N, or 1 for the team as a whole */
+    long table_rows;      /* K */
+    const float *inputs;  /* [L, C, rows, inputs of the first step] */
+    const float *initial; /* [C, rows at the GRU, H] state before the first step */
+    const uint8_t *start; /* [L, C] the state is zeroed before steps where this is not 0 */
+    const float *table;   /* [K, O] what FAN_OUT adds */
+    const int64_t *codes; /* [L, C, N] in 0 .. K - 1, or NULL: one row after another, K = L C N */
+} Batch;
+
+/* One step at work on a block of `rows` rows per column and `count` rows in all. */
+typedef struct {
+    long rows, count;
+    float *forward, *backward, *backward_state;        /* packed weights */
+    float *y, *activated, *statistics, *gates;         /* what the backward pass reads; [count, ...] */
+} Work;
+
+/* Scratch space for one block at a time of all steps. */
+typedef struct {
+    float *products, *before, *carried, *gate_gradients;
+    float *candidate, *middle, *state, *left;      /* left factors of outer products: [H], [2 H], [H] and O columns */
+    float *right, *right_state;                    /* their right factors */
+    float *bias;                                   /* [4 H] */
+    float *layer_gradient;                         /* [BLOCK, O] */
+    float *from_above, *to_below;                  /* gradients between steps */
+    float *inputs;
+    uint8_t *start;
+    int64_t *codes, *actions;
+    float *of_loss[2], *weights;
+} Scratch;
+
 /* GRU. */
 
 /* The state before a step: that after the step before, or zero where an episode starts. */
@@ -347,20 +428,6 @@ static void state_before(long rows, long H, const float *states, const uint8_t *
             memset(before + row * H, 0, (size_t)H * sizeof(float));
         else
             memcpy(before + row * H, states + row * H, (size_t)H * sizeof(float));
-}
-
-typedef struct {
-    float *weights;  /* per panel of H and gate: input part [I, COLUMNS], state part [H, COLUMNS] */
-    float *before;   /* [BLOCK, H] */
-    float *products; /* reset, update, candidate from the input, candidate from the state: [4, BLOCK, COLUMNS] */
-} GruForward;
-
-static GruForward gru_forward_scratch(Arena *arena, long I, long H) {
-    GruForward s;
-    s.weights = take(arena, 3 * (packed_size(I, H) + packed_size(H, H)));
-    s.before = take(arena, BLOCK * H);
-    s.products = take(arena, 4 * BLOCK * COLUMNS);
-    return s;
 }
 
 /* Gates, candidate and new state of a panel of at most COLUMNS units; products as in GruForward. In two passes, so that
@@ -397,106 +464,71 @@ static void gates_panel(long rows, long columns, long H, float *products, const 
     });
 }
 
-/* States [L, R, H] after each step; gates, unless NULL: [L, R, 4 H] candidate, reset, update, candidate from the state.
- * inputs [L, R, I], initial [R, H], start [L, R], weight_ih [3 H, I], weight_hh [3 H, H], bias_ih, bias_hh [3 H] in the
- * order reset, update, candidate. Returns 0, or 1 if there is no memory. */
-int gru_forward(long L, long R, long I, long H, const float *inputs, const float *initial, const uint8_t *start,
-                const float *weight_ih, const float *weight_hh, const float *bias_ih, const float *bias_hh,
-                float *states, float *gates) {
-    Arena arena = {0};
-    gru_forward_scratch(&arena, I, H);
-    if (!begin_arena(&arena))
-        return 1;
-    GruForward s = gru_forward_scratch(&arena, I, H);
-    unsigned long mode = begin_flush();
-    const long panel = (I + H) * COLUMNS;
-    for (long column = 0, p = 0; column < H; column += COLUMNS)
-        for (long gate = 0; gate < 3; gate++, p++) {
-            long columns = min(COLUMNS, H - column), first = gate * H + column;
-            pack_transposed_panel(I, columns, weight_ih + first * I, I, s.weights + p * panel);
-            pack_transposed_panel(H, columns, weight_hh + first * H, H, s.weights + p * panel + I * COLUMNS);
+static void pack_gru(const Step *step, float *packed) {
+    const long I = step->inputs, H = step->outputs, panel = (I + H) * COLUMNS;
+    for (long column = 0; column < H; column += COLUMNS)
+        for (long gate = 0; gate < 3; gate++, packed += panel) {
+            const long columns = min(COLUMNS, H - column), first = gate * H + column;
+            pack_transposed_panel(I, columns, step->parameters[0] + first * I, I, packed);
+            pack_transposed_panel(H, columns, step->parameters[1] + first * H, H, packed + I * COLUMNS);
         }
+}
+
+/* States [L, R, H] after each step; gates, unless NULL: [L, R, 4 H] candidate, reset, update, candidate from the state.
+ * inputs [L, R, I], initial [R, H], start [L, R]. */
+static void gru_forward(long L, long R, const Step *step, const Work *work, const float *inputs, const float *initial,
+                        const Scratch *s) {
+    const long I = step->inputs, H = step->outputs, panel = (I + H) * COLUMNS;
+    const float *bias_ih = step->parameters[2], *bias_hh = step->parameters[3];
+    float *states = work->y, *gates = work->gates;
     for (long first = 0; first < R; first += BLOCK) {
         const long rows = min(BLOCK, R - first);
         for (long t = 0; t < L; t++) {
             const long at = t * R + first;
             const float *x = inputs + at * I;
-            state_before(rows, H, t ? states + (at - R) * H : initial + first * H, start + at, s.before);
-            const float *weights = s.weights;
+            state_before(rows, H, t ? states + (at - R) * H : initial + first * H, s->start + at, s->before);
+            const float *weights = work->forward;
             for (long column = 0; column < H; column += COLUMNS) {
                 for (long gate = 0; gate < 3; gate++, weights += panel) {
-                    float *from_input = s.products + gate * BLOCK * COLUMNS;
+                    float *from_input = s->products + gate * BLOCK * COLUMNS;
                     float *from_state = gate < 2 ? from_input : from_input + BLOCK * COLUMNS;
                     times_panel(rows, I, x, I, weights, from_input, COLUMNS, 0);
-                    times_panel(rows, H, s.before, H, weights + I * COLUMNS, from_state, COLUMNS, gate < 2);
+                    times_panel(rows, H, s->before, H, weights + I * COLUMNS, from_state, COLUMNS, gate < 2);
                 }
-                gates_panel(rows, min(COLUMNS, H - column), H, s.products, s.before + column, bias_ih + column,
+                gates_panel(rows, min(COLUMNS, H - column), H, s->products, s->before + column, bias_ih + column,
                             bias_hh + column, states + at * H + column, gates ? gates + at * 4 * H + column : NULL);
             }
         }
     }
-    end_flush(mode);
-    free(arena.base);
-    return 0;
 }
 
-typedef struct {
-    float *weight_ih, *weight_hh;      /* packed; weight_ih with the candidate's rows first */
-    float *before, *carried;           /* [BLOCK, H] */
-    float *gates;                      /* [BLOCK, 4 H] gradients: candidate, reset, update, candidate from the state */
-    float *candidate, *middle, *state; /* the same packed: [H], [2 H], [H] columns */
-    float *inputs_right, *before_right;
-    float *bias;                       /* [4 H] */
-} GruBackward;
-
-static GruBackward gru_backward_scratch(Arena *arena, long I, long H) {
-    GruBackward s;
-    s.weight_ih = take(arena, packed_size(3 * H, I));
-    s.weight_hh = take(arena, packed_size(3 * H, H));
-    s.before = take(arena, BLOCK * H);
-    s.carried = take(arena, BLOCK * H);
-    s.gates = take(arena, BLOCK * 4 * H);
-    s.candidate = take(arena, left_size(H));
-    s.middle = take(arena, left_size(2 * H));
-    s.state = take(arena, left_size(H));
-    s.inputs_right = take(arena, packed_size(DEPTH, I));
-    s.before_right = take(arena, packed_size(DEPTH, H));
-    s.bias = take(arena, 4 * H);
-    return s;
-}
-
-/* Gradients of what gru_forward computed, from those of its states; the other names as there.
- * grad_inputs and grad_initial may be NULL. */
-int gru_backward(long L, long R, long I, long H, const float *inputs, const float *initial, const uint8_t *start,
-                 const float *weight_ih, const float *weight_hh, const float *states, const float *gates,
-                 const float *grad_states, float *grad_inputs, float *grad_initial, float *grad_weight_ih,
-                 float *grad_weight_hh, float *grad_bias_ih, float *grad_bias_hh) {
-    Arena arena = {0};
-    gru_backward_scratch(&arena, I, H);
-    if (!begin_arena(&arena))
-        return 1;
-    GruBackward s = gru_backward_scratch(&arena, I, H);
-    unsigned long mode = begin_flush();
-    for (long column = 0; column < I && grad_inputs; column += COLUMNS) {
-        float *panel = s.weight_ih + 3 * H * column;
+static void pack_gru_backward(const Step *step, Work *work, int to_inputs) {
+    const long I = step->inputs, H = step->outputs;
+    for (long column = 0; column < I && to_inputs; column += COLUMNS) {
+        float *panel = work->backward + 3 * H * column;
         const long columns = min(COLUMNS, I - column);
-        pack(H, columns, weight_ih + 2 * H * I + column, I, panel, H);
-        pack(2 * H, columns, weight_ih + column, I, panel + H * COLUMNS, 2 * H);
+        pack(H, columns, step->parameters[0] + 2 * H * I + column, I, panel, H); /* the candidate's rows come first */
+        pack(2 * H, columns, step->parameters[0] + column, I, panel + H * COLUMNS, 2 * H);
     }
-    pack(3 * H, H, weight_hh, H, s.weight_hh, 3 * H);
-    memset(grad_weight_ih, 0, (size_t)(3 * H * I) * sizeof(float));
-    memset(grad_weight_hh, 0, (size_t)(3 * H * H) * sizeof(float));
-    memset(s.bias, 0, (size_t)(4 * H) * sizeof(float));
+    pack(3 * H, H, step->parameters[1], H, work->backward_state, 3 * H);
+}
+
+/* Gradients of what gru_forward computed, from those of its states [L, R, H]; grad_inputs may be NULL. */
+static void gru_backward(long L, long R, const Step *step, const Work *work, const float *inputs, const float *initial,
+                         const float *grad_states, float *grad_inputs, const Scratch *s) {
+    const long I = step->inputs, H = step->outputs;
+    memset(s->bias, 0, (size_t)(4 * H) * sizeof(float));
     long filled = 0;
     for (long first = 0; first < R; first += BLOCK) {
         const long rows = min(BLOCK, R - first);
-        memset(s.carried, 0, (size_t)(rows * H) * sizeof(float));
+        memset(s->carried, 0, (size_t)(rows * H) * sizeof(float));
         for (long t = L - 1; t >= 0; t--) {
             const long at = t * R + first;
-            state_before(rows, H, t ? states + (at - R) * H : initial + first * H, start + at, s.before);
+            state_before(rows, H, t ? work->y + (at - R) * H : initial + first * H, s->start + at, s->before);
             for (long row = 0; row < rows; row++) {
-                const float *saved = gates + (at + row) * 4 * H, *incoming = grad_states + (at + row) * H;
-                float *out = s.gates + row * 4 * H, *carried = s.carried + row * H, *before = s.before + row * H;
+                const float *saved = work->gates + (at + row) * 4 * H, *incoming = grad_states + (at + row) * H;
+                float *out = s->gate_gradients + row * 4 * H, *carried = s->carried + row * H;
+                const float *before = s->before + row * H;
                 FOR_EACH_VECTOR(H, {
                     vec candidate = load_upto(saved + j, lanes), reset = load_upto(saved + H + j, lanes);
                     vec update = load_upto(saved + 2 * H + j, lanes), from_state = load_upto(saved + 3 * H + j, lanes);
@@ -511,46 +543,47 @@ int gru_backward(long L, long R, long I, long H, const float *inputs, const floa
                     store_upto(out + H + j, to_reset, lanes);
                     store_upto(out + 2 * H + j, to_update, lanes);
                     store_upto(out + 3 * H + j, to_state, lanes);
-                    add_to(s.bias + j, to_candidate, lanes);
-                    add_to(s.bias + H + j, to_reset, lanes);
-                    add_to(s.bias + 2 * H + j, to_update, lanes);
-                    add_to(s.bias + 3 * H + j, to_state, lanes);
+                    add_to(s->bias + j, to_candidate, lanes);
+                    add_to(s->bias + H + j, to_reset, lanes);
+                    add_to(s->bias + 2 * H + j, to_update, lanes);
+                    add_to(s->bias + 3 * H + j, to_state, lanes);
                 });
             }
             if (grad_inputs)
-                times_packed(rows, I, 3 * H, s.gates, 4 * H, s.weight_ih, grad_inputs + at * I, I, 0);
-            if (t || grad_initial)
-                times_packed(rows, H, 3 * H, s.gates + H, 4 * H, s.weight_hh, s.carried, H, 1);
+                times_packed(rows, I, 3 * H, s->gate_gradients, 4 * H, work->backward, grad_inputs + at * I, I, 0);
+            if (t)
+                times_packed(rows, H, 3 * H, s->gate_gradients + H, 4 * H, work->backward_state, s->carried, H, 1);
             for (long row = 0; row < rows; row++)
-                if (start[at + row])
-                    memset(s.carried + row * H, 0, (size_t)H * sizeof(float));
-            pack_left(rows, H, s.gates, 4 * H, s.candidate + filled * ROWS);
-            pack_left(rows, 2 * H, s.gates + H, 4 * H, s.middle + filled * ROWS);
-            pack_left(rows, H, s.gates + 3 * H, 4 * H, s.state + filled * ROWS);
-            pack(rows, I, inputs + at * I, I, s.inputs_right + filled * COLUMNS, DEPTH);
-            pack(rows, H, s.before, H, s.before_right + filled * COLUMNS, DEPTH);
+                if (s->start[at + row])
+                    memset(s->carried + row * H, 0, (size_t)H * sizeof(float));
+            pack_left(rows, H, s->gate_gradients, 4 * H, s->candidate + filled * ROWS);
+            pack_left(rows, 2 * H, s->gate_gradients + H, 4 * H, s->middle + filled * ROWS);
+            pack_left(rows, H, s->gate_gradients + 3 * H, 4 * H, s->state + filled * ROWS);
+            pack(rows, I, inputs + at * I, I, s->right + filled * COLUMNS, DEPTH);
+            pack(rows, H, s->before, H, s->right_state + filled * COLUMNS, DEPTH);
             filled += rows;
             const long next = t ? rows : min(BLOCK, R - first - rows);
             if (filled + next > DEPTH || next <= 0) {
-                add_outer(2 * H, I, filled, s.middle, s.inputs_right, grad_weight_ih);
-                add_outer(H, I, filled, s.candidate, s.inputs_right, grad_weight_ih + 2 * H * I);
-                add_outer(2 * H, H, filled, s.middle, s.before_right, grad_weight_hh);
-                add_outer(H, H, filled, s.state, s.before_right, grad_weight_hh + 2 * H * H);
+                float *to_ih = step->gradients[0], *to_hh = step->gradients[1];
+                add_outer(2 * H, I, filled, s->middle, s->right, to_ih);
+                add_outer(H, I, filled, s->candidate, s->right, to_ih + 2 * H * I);
+                add_outer(2 * H, H, filled, s->middle, s->right_state, to_hh);
+                add_outer(H, H, filled, s->state, s->right_state, to_hh + 2 * H * H);
                 filled = 0;
             }
         }
-        if (grad_initial)
-            memcpy(grad_initial + first * H, s.carried, (size_t)(rows * H) * sizeof(float));
     }
-    memcpy(grad_bias_ih, s.bias + H, (size_t)(2 * H) * sizeof(float));
-    memcpy(grad_bias_ih + 2 * H, s.bias, (size_t)H * sizeof(float));
-    memcpy(grad_bias_hh, s.bias + H, (size_t)(3 * H) * sizeof(float));
-    end_flush(mode);
-    free(arena.base);
-    return 0;
+    for (long j = 0; j < H; j++) {
+        step->gradients[2][j] += s->bias[H + j];
+        step->gradients[2][H + j] += s->bias[2 * H + j];
+        step->gradients[2][2 * H + j] += s->bias[j];
+        step->gradients[3][j] += s->bias[H + j];
+        step->gradients[3][H + j] += s->bias[2 * H + j];
+        step->gradients[3][2 * H + j] += s->bias[3 * H + j];
+    }
 }
 
-/* [linear, activation, LayerNorm]. */
+/* [linear, activation, LayerNorm], and the fan-out. */
 
 INLINE vec activate(vec x, int activation) {
     return activation == RELU ? choose(x < all(0), all(0), x) : activation == TANH ? tanh_of(x) : x;
@@ -614,40 +647,31 @@ static void normalise(long rows, long O, const float *from, const float *scale, 
     else                                                                                                               \
         call(IDENTITY);
 
-/* y[T, O] = LayerNorm(activation(x weight^T + bias)).
- * x [T, I]. weight [O, I] or NULL: x itself, I = O. bias [O] or NULL. scale, shift [O], or both NULL: no LayerNorm.
- * For layer_backward: activated [T, O] and statistics [T, 2], or NULL; `activated` is not written, and need not be
- * there, where it would equal x or y. Returns 0, or 1 if there is no memory. */
-int layer_forward(long T, long I, long O, long activation, const float *x, const float *weight, const float *bias,
-                  const float *scale, const float *shift, float *activated, float *statistics, float *y) {
-    Arena arena = {0};
-    take(&arena, weight ? packed_size(I, O) : 0);
-    if (!begin_arena(&arena))
-        return 1;
-    float *packed = take(&arena, weight ? packed_size(I, O) : 0);
-    unsigned long mode = begin_flush();
-    if (weight)
-        pack_transposed(I, O, weight, packed);
-    const int as_it_is = !weight && activation == IDENTITY && scale;
-    float own_statistics[2 * BLOCK];
-    for (long first = 0; first < T; first += BLOCK) {
-        const long rows = min(BLOCK, T - first);
-        float *middle = (activated && scale && !as_it_is ? activated : y) + first * O;
-        float *pairs = statistics ? statistics + 2 * first : own_statistics;
+/* Whether what a LAYER normalises is neither its input nor its output, so that it is kept apart. */
+static int keeps_activated(const Step *step) {
+    return step->parameters[2] && (step->parameters[0] || step->activation != IDENTITY);
+}
+
+static void layer_forward(const Step *step, const Work *work, const float *x) {
+    const float *weight = step->parameters[0], *bias = step->parameters[1], *scale = step->parameters[2];
+    const long I = step->inputs, O = step->outputs;
+    const int only_norm = scale && !keeps_activated(step);
+    for (long first = 0; first < work->count; first += BLOCK) {
+        const long rows = min(BLOCK, work->count - first);
+        float *y = work->y + first * O, *middle = keeps_activated(step) ? work->activated + first * O : y;
+        float *statistics = work->statistics + 2 * first;
         if (weight)
-            times_packed(rows, O, I, x + first * I, I, packed, middle, O, 0);
+            times_packed(rows, O, I, x + first * I, I, work->forward, middle, O, 0);
         const float *from = weight ? middle : x + first * O;
         for (long row = 0; row < rows; row++) {
-#define CALL(kind) activate_row(O, kind, from + row * O, bias, as_it_is ? NULL : middle + row * O, pairs + 2 * row)
-            FOR_ACTIVATION(activation, CALL)
+#define CALL(kind)                                                                                                     \
+    activate_row(O, kind, from + row * O, bias, only_norm ? NULL : middle + row * O, statistics + 2 * row)
+            FOR_ACTIVATION(step->activation, CALL)
 #undef CALL
         }
         if (scale)
-            normalise(rows, O, as_it_is ? from : middle, scale, shift, pairs, y + first * O);
+            normalise(rows, O, only_norm ? from : middle, scale, step->parameters[3], statistics, y);
     }
-    end_flush(mode);
-    free(arena.base);
-    return 0;
 }
 
 /* What the LayerNorms of a block of rows add to the gradients of scale and shift, and for each row the means over the
@@ -689,120 +713,354 @@ INLINE void row_backward(long O, const int activation, const float *activated, c
     });
 }
 
-typedef struct {
-    float *weight, *grad, *left, *right;
-} LayerBackward;
-
-static LayerBackward layer_backward_scratch(Arena *arena, long I, long O, int linear) {
-    LayerBackward s = {0};
-    s.grad = take(arena, BLOCK * O);
-    if (linear) {
-        s.weight = take(arena, packed_size(O, I));
-        s.left = take(arena, left_size(O));
-        s.right = take(arena, packed_size(DEPTH, I));
-    }
-    return s;
-}
-
-/* Gradients of what layer_forward computed, from that of y. Where it did not write `activated`, give x or y here. Those
- * of a part that is not there are NULL; grad_x may be NULL if nobody needs it. Returns 0, or 1 without memory. */
-int layer_backward(long T, long I, long O, long activation, const float *x, const float *weight, const float *scale,
-                   const float *activated, const float *statistics, const float *grad_y, float *grad_x,
-                   float *grad_weight, float *grad_bias, float *grad_scale, float *grad_shift) {
-    Arena arena = {0};
-    layer_backward_scratch(&arena, I, O, weight != NULL);
-    if (!begin_arena(&arena))
-        return 1;
-    LayerBackward s = layer_backward_scratch(&arena, I, O, weight != NULL);
-    unsigned long mode = begin_flush();
-    if (weight) {
-        if (grad_x)
-            pack(O, I, weight, I, s.weight, O);
-        memset(grad_weight, 0, (size_t)(O * I) * sizeof(float));
-    }
-    if (grad_bias)
-        memset(grad_bias, 0, (size_t)O * sizeof(float));
-    if (scale) {
-        memset(grad_scale, 0, (size_t)O * sizeof(float));
-        memset(grad_shift, 0, (size_t)O * sizeof(float));
-    }
+/* Gradients of what layer_forward computed, from that of y [count, O]; grad_x may be NULL if nobody needs it. */
+static void layer_backward(const Step *step, const Work *work, const float *x, const float *grad_y, float *grad_x,
+                           const Scratch *s) {
+    const float *weight = step->parameters[0], *scale = step->parameters[2];
+    const long I = step->inputs, O = step->outputs;
+    const float *activated = keeps_activated(step) ? work->activated : scale ? x : work->y;
     float means[2 * BLOCK];
     long filled = 0;
-    for (long first = 0; first < T; first += BLOCK) {
-        const long rows = min(BLOCK, T - first);
-        const float *pairs = scale ? statistics + 2 * first : NULL;
+    for (long first = 0; first < work->count; first += BLOCK) {
+        const long rows = min(BLOCK, work->count - first);
         const float *from = activated + first * O, *incoming = grad_y + first * O;
-        float *grad = weight ? s.grad : grad_x ? grad_x + first * O : NULL;
+        const float *statistics = work->statistics + 2 * first;
+        float *grad = weight ? s->layer_gradient : grad_x ? grad_x + first * O : NULL;
         if (scale)
-            normalise_backward(rows, O, from, pairs, scale, incoming, grad_scale, grad_shift, means);
+            normalise_backward(rows, O, from, statistics, scale, incoming, step->gradients[2], step->gradients[3], means);
         for (long row = 0; row < rows && grad; row++) {
 #define CALL(kind)                                                                                                     \
-    row_backward(O, kind, from + row * O, pairs + 2 * row, means + 2 * row, scale, incoming + row * O,                 \
-                 grad + row * O, grad_bias)
-            FOR_ACTIVATION(activation, CALL)
+    row_backward(O, kind, from + row * O, statistics + 2 * row, means + 2 * row, scale, incoming + row * O,            \
+                 grad + row * O, step->gradients[1])
+            FOR_ACTIVATION(step->activation, CALL)
 #undef CALL
         }
         if (!weight)
             continue;
         if (grad_x)
-            times_packed(rows, I, O, grad, O, s.weight, grad_x + first * I, I, 0);
-        pack_left(rows, O, grad, O, s.left + filled * ROWS);
-        pack(rows, I, x + first * I, I, s.right + filled * COLUMNS, DEPTH);
+            times_packed(rows, I, O, grad, O, work->backward, grad_x + first * I, I, 0);
+        pack_left(rows, O, grad, O, s->left + filled * ROWS);
+        pack(rows, I, x + first * I, I, s->right + filled * COLUMNS, DEPTH);
         filled += rows;
-        if (filled + BLOCK > DEPTH || first + rows == T) {
-            add_outer(O, I, filled, s.left, s.right, grad_weight);
+        if (filled + BLOCK > DEPTH || first + rows == work->count) {
+            add_outer(O, I, filled, s->left, s->right, step->gradients[0]);
             filled = 0;
         }
+    }
+}
+
+/* y[row] = LayerNorm(relu(table[code of row] + x[row / N])). */
+static void fan_out_forward(const Step *step, const Work *work, long N, const float *table, const float *x,
+                            const Scratch *s) {
+    const long O = step->outputs;
+    for (long first = 0; first < work->count; first += BLOCK) {
+        const long end = min(first + BLOCK, work->count);
+        for (long row = first; row < end; row++)
+            activate_row(O, RELU, table + s->codes[row] * O, x + row / N * O, work->activated + row * O,
+                         work->statistics + 2 * row);
+        normalise(end - first, O, work->activated + first * O, step->parameters[2], step->parameters[3],
+                  work->statistics + 2 * first, work->y + first * O);
+    }
+}
+
+static void fan_out_backward(const Step *step, const Work *work, long N, const float *grad_y, float *grad_table,
+                             float *grad_x, const Scratch *s) {
+    const long O = step->outputs;
+    const float *scale = step->parameters[2];
+    memset(grad_x, 0, (size_t)(work->count / N * O) * sizeof(float));
+    float means[2 * BLOCK];
+    for (long first = 0; first < work->count; first += BLOCK) {
+        const long end = min(first + BLOCK, work->count);
+        normalise_backward(end - first, O, work->activated + first * O, work->statistics + 2 * first, scale,
+                           grad_y + first * O, step->gradients[2], step->gradients[3], means);
+        for (long row = first; row < end; row++) {
+            float *to = grad_table + s->codes[row] * O, *grad = s->layer_gradient;
+            row_backward(O, RELU, work->activated + row * O, work->statistics + 2 * row, means + 2 * (row - first), scale,
+                         grad_y + row * O, grad, grad_x + row / N * O);
+            FOR_EACH_VECTOR(O, { add_to(to + j, load_upto(grad + j, lanes), lanes); });
+        }
+    }
+}
+
+/* Losses: sums over weighted rows, each with its gradient. */
+
+enum { POLICY = 0, VALUE = 1, REWARD = 2 };
+
+typedef struct {
+    long kind;
+    double numbers[3];
+    const int64_t *actions; /* [L, C, N] for POLICY and REWARD */
+    const float *data[2];   /* POLICY: old log-probabilities, advantages [L, C, N]. VALUE: old values, targets [L, C].
+                               REWARD: rewards [L, C] */
+    const float *weights;   /* [L, C] */
+} Loss;
+
+/* -surrogate (eq. 4) - bonus * entropy, on T rows of A logits; numbers: clip, bonus.
+ * To sums [4] is added: the negated surrogate, the entropy, the fraction of clipped ratios, -log ratio. */
+static void policy_loss(long T, long N, long A, const Loss *loss, const float *logits, float *grad, double *sums,
+                        const Scratch *s) {
+    const float clip = (float)loss->numbers[0], bonus = (float)loss->numbers[1];
+    double surrogates = 0, entropies = 0, clipped = 0, divergences = 0;
+    for (long row = 0; row < T; row++, logits += A, grad += A) {
+        float largest = logits[0];
+        for (long a = 1; a < A; a++)
+            largest = logits[a] > largest ? logits[a] : largest;
+        vec total = all(0), expected = all(0);
+        FOR_EACH_VECTOR(A, {
+            vec apart = load_upto(logits + j, lanes) - all(largest);
+            store_upto(grad + j, exp_of(apart), lanes);
+            vec e = load_upto(grad + j, lanes); /* nothing beyond the last action */
+            total += e;
+            expected += e * apart;
+        });
+        const float sum = sum_of(total), log_sum = logf(sum), entropy = log_sum - sum_of(expected) / sum;
+        const long action = s->actions[row];
+        const float log_ratio = logits[action] - largest - log_sum - s->of_loss[0][row], ratio = expf(log_ratio);
+        const float advantage = s->of_loss[1][row], weight = s->weights[row / N];
+        const float free = ratio * advantage, held = fminf(fmaxf(ratio, 1 - clip), 1 + clip) * advantage;
+        const float push = free <= held ? free : 0; /* also within the clip range, where the two are one */
+        const vec factor = all(weight / sum), above = all(entropy - log_sum);
+        FOR_EACH_VECTOR(A, {
+            vec slope = all(push) + all(bonus) * (load_upto(logits + j, lanes) - all(largest) + above);
+            store_upto(grad + j, load_upto(grad + j, lanes) * factor * slope, lanes);
+        });
+        grad[action] -= push * weight;
+        surrogates -= (double)(fminf(free, held) * weight);
+        entropies += (double)(entropy * weight);
+        clipped += fabsf(ratio - 1) > clip ? (double)weight : 0;
+        divergences -= (double)(log_ratio * weight);
+    }
+    sums[0] += surrogates;
+    sums[1] += entropies;
+    sums[2] += clipped;
+    sums[3] += divergences;
+}
+
+INLINE float huber(float error, float delta) {
+    const float size = fabsf(error);
+    return size <= delta ? error * error / 2 : delta * (size - delta / 2);
+}
+
+/* The clipped value loss (eq. 40) with Huber errors on T values; numbers: clip, delta, and what the gradient is
+ * multiplied with. sums [1]. */
+static void value_loss(long T, const Loss *loss, const float *values, float *grad, double *sums, const Scratch *s) {
+    const float clip = (float)loss->numbers[0], delta = (float)loss->numbers[1], coefficient = (float)loss->numbers[2];
+    for (long row = 0; row < T; row++) {
+        const float old = s->of_loss[0][row], target = s->of_loss[1][row], weight = s->weights[row];
+        const float free = values[row] - target, held = old + fminf(fmaxf(values[row] - old, -clip), clip) - target;
+        const float of_free = huber(free, delta), of_held = huber(held, delta);
+        const int moves = !(of_held > of_free);
+        sums[0] += (double)((moves ? of_free : of_held) * weight);
+        grad[row] = moves ? (free > delta ? delta : free < -delta ? -delta : free) * weight * coefficient : 0;
+    }
+}
+
+/* Half the squared error of the predicted reward of the action taken (eq. 19), on T rows of A predictions. sums [1]. */
+static void reward_loss(long T, long N, long A, const float *predicted, float *grad, double *sums, const Scratch *s) {
+    memset(grad, 0, (size_t)(T * A) * sizeof(float));
+    for (long row = 0; row < T; row++) {
+        const long at = row * A + s->actions[row];
+        const float error = predicted[at] - s->of_loss[0][row / N], weight = s->weights[row / N];
+        sums[0] += (double)(error * error * weight) / 2;
+        grad[at] = error * weight;
+    }
+}
+
+/* The whole network. */
+
+static long rows_at_gru(const Step *steps, long count, const Batch *batch) {
+    long rows = batch->rows;
+    for (long i = 0; i < count; i++) {
+        if (steps[i].kind == GRU)
+            return rows;
+        rows = steps[i].kind == FAN_OUT ? batch->agents : rows;
+    }
+    return rows;
+}
+
+/* Hands out the memory of all steps for blocks of `columns` columns; without `loss`, what a forward pass needs. */
+static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *batch, const Loss *loss, long columns,
+                    Work *works) {
+    Scratch s = {0};
+    const long length = batch->length * columns, all_rows = length * batch->agents;
+    long rows = batch->rows, widest = 1, inputs = 1, outputs = 1, units = 1;
+    for (long i = 0; i < count; i++) {
+        const Step *step = steps + i;
+        const long I = step->inputs, O = step->outputs;
+        rows = step->kind == FAN_OUT ? batch->agents : rows;
+        Work *work = works + i;
+        work->rows = rows;
+        work->count = length * rows;
+        work->y = take(arena, work->count * O);
+        work->activated = keeps_activated(step) || step->kind == FAN_OUT ? take(arena, work->count * O) : NULL;
+        work->statistics = take(arena, 2 * work->count);
+        if (step->kind == GRU) {
+            work->forward = take(arena, 3 * packed_size(I + O, O));
+            work->gates = loss ? take(arena, work->count * 4 * O) : NULL;
+            work->backward = loss ? take(arena, packed_size(3 * O, I)) : NULL;
+            work->backward_state = loss ? take(arena, packed_size(3 * O, O)) : NULL;
+            units = max(units, O);
+        } else if (step->kind == LAYER && step->parameters[0]) {
+            work->forward = take(arena, packed_size(I, O));
+            work->backward = loss ? take(arena, packed_size(O, I)) : NULL;
+        }
+        inputs = max(inputs, I);
+        outputs = max(outputs, O);
+        widest = max(widest, work->count * max(O, i ? I : 0));
+    }
+    s.inputs = take(arena, length * batch->rows * steps[0].inputs);
+    s.products = take(arena, 4 * BLOCK * COLUMNS);
+    s.before = take(arena, BLOCK * units);
+    s.start = take_bytes(arena, all_rows);
+    s.codes = take_bytes(arena, all_rows * (long)sizeof(int64_t));
+    if (!loss)
+        return s;
+    s.carried = take(arena, BLOCK * units);
+    s.gate_gradients = take(arena, BLOCK * 4 * units);
+    s.candidate = take(arena, left_size(units));
+    s.middle = take(arena, left_size(2 * units));
+    s.state = take(arena, left_size(units));
+    s.left = take(arena, left_size(outputs));
+    s.right = take(arena, packed_size(DEPTH, inputs));
+    s.right_state = take(arena, packed_size(DEPTH, units));
+    s.bias = take(arena, 4 * units);
+    s.layer_gradient = take(arena, BLOCK * outputs);
+    s.from_above = take(arena, widest);
+    s.to_below = take(arena, widest);
+    s.actions = take_bytes(arena, all_rows * (long)sizeof(int64_t));
+    s.of_loss[0] = take(arena, all_rows);
+    s.of_loss[1] = take(arena, all_rows);
+    s.weights = take(arena, length);
+    return s;
+}
+
+/* Copies columns first .. first + columns of from[L, C, bytes of a column]; and back. */
+static void gather(long L, long C, long first, long columns, long bytes, const void *from, void *to) {
+    for (long t = 0; t < L; t++)
+        memcpy((char *)to + t * columns * bytes, (const char *)from + (t * C + first) * bytes, (size_t)(columns * bytes));
+}
+
+static void scatter(long L, long C, long first, long columns, long bytes, const void *from, void *to) {
+    for (long t = 0; t < L; t++)
+        memcpy((char *)to + (t * C + first) * bytes, (const char *)from + t * columns * bytes, (size_t)(columns * bytes));
+}
+
+static void forward_block(const Step *steps, long count, const Batch *batch, long first, long columns, Work *works,
+                          Scratch *s) {
+    const long L = batch->length, C = batch->columns, N = batch->agents;
+    gather(L, C, first, columns, batch->rows * steps[0].inputs * (long)sizeof(float), batch->inputs, s->inputs);
+    const float *x = s->inputs;
+    for (long i = 0; i < count; i++) {
+        const Step *step = steps + i;
+        Work *work = works + i;
+        work->count = L * columns * work->rows;
+        if (step->kind == GRU) {
+            uint8_t *start = s->start;
+            for (long t = 0; t < L; t++)
+                for (long column = first; column < first + columns; column++, start += work->rows)
+                    memset(start, batch->start[t * C + column], (size_t)work->rows);
+            gru_forward(L, columns * work->rows, step, work, x, batch->initial + first * work->rows * step->outputs, s);
+        } else if (step->kind == FAN_OUT) {
+            if (batch->codes)
+                gather(L, C, first, columns, N * (long)sizeof(int64_t), batch->codes, s->codes);
+            else
+                for (long t = 0, row = 0; t < L; t++)
+                    for (long at = (t * C + first) * N; at < (t * C + first + columns) * N; at++)
+                        s->codes[row++] = at;
+            fan_out_forward(step, work, N, batch->table, x, s);
+        } else {
+            layer_forward(step, work, x);
+        }
+        x = work->y;
+    }
+}
+
+static void loss_of_block(const Batch *batch, long first, long columns, const Loss *loss, const Work *last, long outputs,
+                          double *sums, Scratch *s) {
+    const long L = batch->length, C = batch->columns, N = batch->agents, size = (long)sizeof(float);
+    gather(L, C, first, columns, size, loss->weights, s->weights);
+    for (int i = 0; i < 2; i++)
+        if (loss->data[i])
+            gather(L, C, first, columns, loss->kind == POLICY ? N * size : size, loss->data[i], s->of_loss[i]);
+    if (loss->actions)
+        gather(L, C, first, columns, N * (long)sizeof(int64_t), loss->actions, s->actions);
+    if (loss->kind == POLICY)
+        policy_loss(last->count, N, outputs, loss, last->y, s->from_above, sums, s);
+    else if (loss->kind == VALUE)
+        value_loss(last->count, loss, last->y, s->from_above, sums, s);
+    else
+        reward_loss(last->count, N, outputs, last->y, s->from_above, sums, s);
+}
+
+static void backward_block(const Step *steps, long count, const Batch *batch, long first, long columns, float *grad_table,
+                           const Work *works, Scratch *s) {
+    for (long i = count - 1; i >= 0; i--) {
+        const Step *step = steps + i;
+        const Work *work = works + i;
+        const float *x = i ? works[i - 1].y : s->inputs;
+        float *to_below = i ? s->to_below : NULL;
+        if (step->kind == GRU)
+            gru_backward(batch->length, columns * work->rows, step, work, x,
+                         batch->initial + first * work->rows * step->outputs, s->from_above, to_below, s);
+        else if (step->kind == FAN_OUT)
+            fan_out_backward(step, work, batch->agents, s->from_above, grad_table, s->to_below, s);
+        else
+            layer_backward(step, work, x, s->from_above, to_below, s);
+        s->to_below = s->from_above;
+        s->from_above = to_below;
+    }
+}
+
+/* Forward passes over all columns, and with `loss` backward passes, too. Returns 0, or 1 if there is no memory. */
+static int run(const Step *steps, long count, const Batch *batch, const Loss *loss, float *outputs, float *states,
+               float *grad_table, double *sums) {
+    const long L = batch->length, C = batch->columns, size = (long)sizeof(float);
+    const long block = max(1, min(C, BLOCK / rows_at_gru(steps, count, batch)));
+    Work works[MOST_STEPS] = {0};
+    Arena arena = {0};
+    plan(&arena, steps, count, batch, loss, block, works);
+    if (!begin_arena(&arena))
+        return 1;
+    Scratch s = plan(&arena, steps, count, batch, loss, block, works);
+    const unsigned long mode = begin_flush();
+    for (long i = 0; i < count; i++)
+        if (steps[i].kind == GRU) {
+            pack_gru(steps + i, works[i].forward);
+            if (loss)
+                pack_gru_backward(steps + i, works + i, i > 0);
+        } else if (steps[i].kind == LAYER && steps[i].parameters[0]) {
+            pack_transposed(steps[i].inputs, steps[i].outputs, steps[i].parameters[0], works[i].forward);
+            if (loss && i > 0)
+                pack(steps[i].outputs, steps[i].inputs, steps[i].parameters[0], steps[i].inputs, works[i].backward,
+                     steps[i].outputs);
+        }
+    for (long first = 0; first < C; first += block) {
+        const long columns = min(block, C - first);
+        forward_block(steps, count, batch, first, columns, works, &s);
+        const Work *last = works + count - 1;
+        if (loss) {
+            Scratch passing = s;
+            loss_of_block(batch, first, columns, loss, last, steps[count - 1].outputs, sums, &passing);
+            backward_block(steps, count, batch, first, columns, grad_table, works, &passing);
+        }
+        for (long i = 0; i < count; i++)
+            if (steps[i].kind == GRU && states)
+                scatter(L, C, first, columns, works[i].rows * steps[i].outputs * size, works[i].y, states);
+        if (outputs)
+            scatter(L, C, first, columns, last->rows * steps[count - 1].outputs * size, last->y, outputs);
     }
     end_flush(mode);
     free(arena.base);
     return 0;
 }
 
-/* y[T, O] = LayerNorm(relu(table[code] + shared[row / N])), row by row.
- * table [K, O]. codes [T] in 0 .. K - 1, or NULL: code = row. shared [T / N, O]. scale, shift [O]. activated [T, O],
- * which may be y, and statistics [T, 2] or NULL are for looked_up_backward. Returns 0. */
-int looked_up_forward(long T, long N, long O, const int64_t *codes, const float *table, const float *shared,
-                      const float *scale, const float *shift, float *activated, float *statistics, float *y) {
-    unsigned long mode = begin_flush();
-    float own_statistics[2 * BLOCK];
-    for (long first = 0; first < T; first += BLOCK) {
-        const long end = min(first + BLOCK, T);
-        float *pairs = statistics ? statistics + 2 * first : own_statistics;
-        for (long row = first; row < end; row++)
-            activate_row(O, RELU, table + (codes ? codes[row] : row) * O, shared + row / N * O, activated + row * O,
-                         pairs + 2 * (row - first));
-        normalise(end - first, O, activated + first * O, scale, shift, pairs, y + first * O);
-    }
-    end_flush(mode);
-    return 0;
+/* outputs [L, C, rows at the end, outputs of the last step]; states [L, C, rows at the GRU, H] after each step. */
+int network_forward(const Step *steps, long count, const Batch *batch, float *outputs, float *states) {
+    return run(steps, count, batch, NULL, outputs, states, NULL, NULL);
 }
 
-/* Gradients of what looked_up_forward computed, from that of y; grad_table [K, O]. Returns 0, or 1 without memory. */
-int looked_up_backward(long T, long N, long O, long K, const int64_t *codes, const float *scale, const float *activated,
-                       const float *statistics, const float *grad_y, float *grad_table, float *grad_shared,
-                       float *grad_scale, float *grad_shift) {
-    float *grad = malloc((size_t)O * sizeof(float));
-    if (!grad)
-        return 1;
-    unsigned long mode = begin_flush();
-    memset(grad_table, 0, (size_t)(K * O) * sizeof(float));
-    memset(grad_shared, 0, (size_t)(T / N * O) * sizeof(float));
-    memset(grad_scale, 0, (size_t)O * sizeof(float));
-    memset(grad_shift, 0, (size_t)O * sizeof(float));
-    float means[2 * BLOCK];
-    for (long first = 0; first < T; first += BLOCK) {
-        const long end = min(first + BLOCK, T);
-        normalise_backward(end - first, O, activated + first * O, statistics + 2 * first, scale, grad_y + first * O,
-                           grad_scale, grad_shift, means);
-        for (long row = first; row < end; row++) {
-            float *to = grad_table + (codes ? codes[row] : row) * O;
-            row_backward(O, RELU, activated + row * O, statistics + 2 * row, means + 2 * (row - first), scale,
-                         grad_y + row * O, grad, grad_shared + row / N * O);
-            FOR_EACH_VECTOR(O, { add_to(to + j, load_upto(grad + j, lanes), lanes); });
-        }
-    }
-    end_flush(mode);
-    free(grad);
-    return 0;
+/* Adds the gradients of the loss to those of the steps and to grad_table [K, O], and the loss's sums to `sums` [at most 4]. */
+int network_gradient(const Step *steps, long count, const Batch *batch, const Loss *loss, float *grad_table,
+                     double *sums) {
+    return run(steps, count, batch, loss, NULL, NULL, grad_table, sums);
 }
