@@ -14,7 +14,7 @@ import numpy as np
 from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.files import write_atomically
-from dae_ros.learning.learner import Learner
+from dae_ros.learning.distributed import make_learner
 from dae_ros.learning.policy import Policy
 from dae_ros.report.metrics import MetricsLog
 from dae_ros.run_folder import RunFolder
@@ -44,7 +44,7 @@ class Training:
         self.mean_return = math.nan
         self.evaluation: np.ndarray = np.empty(0)
         self._folder = folder
-        self._learner = Learner(spec, settings.learner, settings.reward_network, settings.run.seed)
+        self._learner = make_learner(spec, settings)
         self._steps_per_rollout = settings.task.num_worlds * settings.run.num_steps
         self._training_rollouts = -(-settings.run.total_steps // self._steps_per_rollout)
         self._rollout = 0

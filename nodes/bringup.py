@@ -15,6 +15,7 @@ import threading
 from datetime import datetime
 from pathlib import Path
 
+from dae_ros import torchrun
 from dae_ros.config import SETTINGS, Settings
 from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
@@ -129,6 +130,11 @@ def main(args: list[str] | None = None) -> int:
     arguments = parse_arguments(args)
     signal.signal(signal.SIGTERM, interrupt)
     try:
+        if torchrun.rank() > 0:
+            from dae_ros.learning.distributed import help_to_learn
+
+            help_to_learn()
+            return 0
         task_file = find_task_file(arguments.task_file) if arguments.task_file else None
         settings = read_settings(task_file, arguments.parameter)
         stem = task_file.stem if task_file else settings.task.task.replace(':', '_')

@@ -13,6 +13,7 @@ from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from std_srvs.srv import Trigger
 
+from dae_ros import torchrun
 from dae_ros.config import (
     LearnerSettings,
     RewardNetworkSettings,
@@ -22,7 +23,9 @@ from dae_ros.config import (
     declarations,
     from_flat,
 )
+from dae_ros.errors import DaeRosError
 from dae_ros.final_report import write_report
+from dae_ros.learning.distributed import help_to_learn
 from dae_ros.rollout.assembler import Assembler
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
@@ -188,7 +191,21 @@ class TrainerNode(TeamNode):
 
 
 def main(args: list[str] | None = None) -> int:
+    if torchrun.rank() > 0:
+        return help_the_leader()
     return run(TrainerNode, args)
+
+
+def help_the_leader() -> int:
+    """What a trainer does that torchrun started beside the one that leads."""
+    try:
+        help_to_learn()
+    except KeyboardInterrupt:
+        pass
+    except DaeRosError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == '__main__':

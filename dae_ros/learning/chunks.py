@@ -33,9 +33,9 @@ def first_states(states: Tensor, length: int) -> Tensor:
     return to_chunks(before, length)[0]
 
 
-def shard_bounds(columns: int, rows_per_column: int) -> list[tuple[int, int]]:
+def shard_bounds(columns: int, rows_per_column: int, at_least: int = 1) -> list[tuple[int, int]]:
     """Splits `columns` chunks or worlds of `rows_per_column` rows each into near-equal runs of at most SHARD_ROWS rows,
-    or of a single column that is longer."""
-    shards = max(1, -(-columns // max(1, SHARD_ROWS // rows_per_column)))
+    or of a single column that is longer; into `at_least` so many."""
+    shards = max(at_least, -(-columns // max(1, SHARD_ROWS // rows_per_column)))
     edges = [round(index * columns / shards) for index in range(shards + 1)]
     return list(zip(edges, edges[1:]))

@@ -52,7 +52,10 @@ class FirstStates(NamedTuple):
 class Learner:
     """Actor, critic and reward networks of one run, and how they learn."""
 
-    def __init__(self, spec: WorldSpec, settings: LearnerSettings, reward_settings: RewardNetworkSettings, seed: int):
+    def __init__(self, spec: WorldSpec, settings: LearnerSettings, reward_settings: RewardNetworkSettings, seed: int,
+                 team=None):
+        """`team`: the `distributed.Team` this process learns with, None to learn alone."""
+        self._team = team
         self._spec = spec
         self._settings = settings
         self._reward_settings = reward_settings
@@ -126,7 +129,8 @@ class Learner:
         # Lines 26 to 32: epochs.
         trainings = [self._train_actor(chunks, first, rollout), self._train_critic(chunks, first, rollout)]
         trainings += [self._train_reward(member, chunks, first, rollout) for member in range(len(self._reward))]
-        for result in self._workers.run(trainings):
+        run = self._workers.run if self._team is None else partial(self._workers.run_together, team=self._team)
+        for result in run(trainings):
             metrics |= result
         return metrics
 
@@ -235,9 +239,8 @@ class Learner:
         steps = epochs * (1 if whole is not None else len(batches))
         return dict(zip(metric_names, (totals / steps).tolist())) | {f'{name}/gradient_norm': norms / steps}
 
-    @staticmethod
-    def _shards(chunks: Chunks, initial: Tensor, rows_per_chunk: int) -> list[tuple[Chunks, Tensor]]:
+    def _shards(self, chunks: Chunks, initial: Tensor, rows_per_chunk: int) -> list[tuple[Chunks, Tensor]]:
         """The chunks of one gradient step in shards; their weights add up to one over the step."""
         chunks = chunks._replace(weights=chunks.weights / chunks.weights.sum())
         return [(Chunks(*(part[:, a:b].contiguous() for part in chunks)), initial[a:b])
-                for a, b in shard_bounds(chunks.weights.shape[1], rows_per_chunk)]
+                for a, b in shard_bounds(chunks.weights.shape[1], rows_per_chunk, 1 if self._team is None else self._team.size)]

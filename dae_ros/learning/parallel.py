@@ -56,5 +56,31 @@ class Workers:
                     advance(index, [future.result() for future in rounds[index]])
         return results
 
+    def run_together(self, trainings: Iterable[Training], team) -> list[Any]:
+        """Like `run`, on the processes of a `distributed.Team`: all trainings take each step together, this process does
+        its share of the tasks, whose results are tuples of tensors, and their sums over all processes are sent back."""
+        trainings = list(trainings)
+        results: list[Any] = [None] * len(trainings)
+        answers: dict[int, list[Any] | None] = dict.fromkeys(range(len(trainings)))
+        while True:
+            futures: dict[int, list[Future]] = {}
+            for index, answer in answers.items():
+                try:
+                    tasks = trainings[index].send(answer)
+                except StopIteration as stop:
+                    results[index] = stop.value
+                else:
+                    futures[index] = [self._pool.submit(task) for task in tasks[team.rank::team.size]]
+            sums = {index: [sum(parts) for parts in zip(*(future.result() for future in own))]
+                    for index, own in futures.items()}
+            flat = [part for parts in sums.values() for part in parts]
+            if not flat:
+                break
+            together = torch.cat(flat)
+            team.add_up(together)
+            pieces = iter(together.split([len(part) for part in flat]))
+            answers = {index: [tuple(next(pieces) for _ in parts)] for index, parts in sums.items()}
+        return results
+
     def close(self) -> None:
         self._pool.shutdown()
