@@ -11,7 +11,7 @@ NUM_AGENTS, NUM_WORLDS, NUM_STEPS, EPOCHS, HIDDEN = 3, 128, 25, 10, 64
 MANY_WORLDS = 4096
 TRAINING = {'task': 'navigation', 'num_agents': NUM_AGENTS, 'num_worlds': NUM_WORLDS, 'num_steps': NUM_STEPS, 'epochs': EPOCHS,
             'num_mini_batches': 1, 'hidden_size': HIDDEN}
-MAPPO, DAE = 'dae_ros MAPPO', 'dae_ros DAE'
+MAPPO, DAE, DAE_SHARED = 'dae_ros MAPPO', 'dae_ros DAE', 'dae_ros DAE, shared trunk'
 JAXMARL_MAPPO, BENCHMARL_MAPPO = 'JaxMARL MAPPO-RNN', 'BenchMARL MAPPO-GRU'
 SCRIPT = 'baselines/MAPPO/mappo_rnn_mpe.py'
 
@@ -34,16 +34,19 @@ class Match(NamedTuple):
 
 def training(checkout: Path | None) -> Match:
     """Rollouts and learning together. `checkout`: JaxMARL's repository, whose script is no part of its package."""
-    contenders = [_ours(MAPPO, {'beta': 0.0}), _ours(DAE, {'beta': 0.95}),
+    contenders = [_ours(MAPPO, {'beta': 0.0}), _ours(DAE, {'beta': 0.95, 'reward_network.architecture': 'per_agent'}),
+                  _ours(DAE_SHARED, {'beta': 0.95, 'reward_network.architecture': 'shared_trunk'}),
                   Contender(BENCHMARL_MAPPO, 'benchmarl', 'train_benchmarl.py', _words(NUM_WORLDS, NUM_STEPS, EPOCHS, HIDDEN))]
     if checkout:
         settings = {'ENV_NAME': 'MPE_simple_spread_v3', 'NUM_ENVS': NUM_WORLDS, 'NUM_STEPS': NUM_STEPS, 'UPDATE_EPOCHS': EPOCHS,
                     'NUM_MINIBATCHES': 1, 'FC_DIM_SIZE': HIDDEN, 'GRU_HIDDEN_DIM': HIDDEN, 'TOTAL_TIMESTEPS': 2 * 10**9}
         contenders.append(Contender(JAXMARL_MAPPO, 'jaxmarl', 'train_jaxmarl.py',
                                     (str(checkout / SCRIPT), *(f'{name}={value}' for name, value in settings.items()))))
+    # No peer has a reward network: ours with one are compared with theirs without.
+    targets = {MAPPO: 2.0, DAE: 1.0, DAE_SHARED: 1.5}
     return Match(f'Rollouts and learning, {NUM_WORLDS} worlds', tuple(contenders), (
-        Comparison(MAPPO, (JAXMARL_MAPPO,), 2.0), Comparison(DAE, (JAXMARL_MAPPO,), 1.0),
-        Comparison(MAPPO, (BENCHMARL_MAPPO,), None), Comparison(DAE, (BENCHMARL_MAPPO,), None)))
+        *(Comparison(ours, (JAXMARL_MAPPO,), target) for ours, target in targets.items()),
+        *(Comparison(ours, (BENCHMARL_MAPPO,), None) for ours in targets)))
 
 
 def simulation(num_worlds: int) -> Match:

@@ -54,10 +54,10 @@ class Outcome(NamedTuple):
     ratios: tuple[Ratio, ...]
 
     def table(self) -> str:
-        lines = [f'{self.title:38}{"median":>12}{"slowest":>12}{"fastest":>12}   [environment steps per second]']
-        lines += [f'  {row.name:36}{row.median:12,.0f}{row.slowest:12,.0f}{row.fastest:12,.0f}' for row in self.rows]
+        lines = [f'{self.title:50}{"median":>12}{"slowest":>12}{"fastest":>12}   [environment steps per second]']
+        lines += [f'  {row.name:48}{row.median:12,.0f}{row.slowest:12,.0f}{row.fastest:12,.0f}' for row in self.rows]
         for ratio in self.ratios:
-            lines.append(f'  {f"{ratio.ours} / {ratio.other}":36}{ratio.value:12.2f}   {ratio.verdict}'.rstrip())
+            lines.append(f'  {f"{ratio.ours} / {ratio.other}":48}{ratio.value:12.2f}   {ratio.verdict}'.rstrip())
         return '\n'.join(lines)
 
     def record(self) -> dict[str, Any]:
