@@ -1,15 +1,22 @@
 """The native kernels compute what torch computes, with the same bits always, and are not needed."""
 
 import copy
+import functools
+import itertools
+import math
 import os
+import shlex
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+from unittest import mock
 
 import pytest
 import torch
 
-from dae_ros.learning import kernels, networks
+from dae_ros.learning import kernels, losses, networks
+from dae_ros.learning.native import build
 from dae_ros.types import WorldSpec
 
 native = pytest.mark.skipif(not kernels.available(), reason='the kernels cannot be compiled here, or are off')
@@ -19,180 +26,448 @@ def randoms(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed + sum(shape)))
 
 
-def starts(*shape):
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(7)) < 0.2
+def uniform(*shape, seed=0):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed + sum(shape)))
 
 
-def outputs_and_gradients(function, tensors):
-    """What `function` gives for the tensors, and the gradients of a fixed linear functional of it."""
-    tensors = [x.detach().requires_grad_() if x.is_floating_point() else x for x in tensors]
-    outputs = [x for x in function(*tensors) if x is not None]
-    loss = sum((x * randoms(*x.shape, seed=index).to(x.dtype)).sum() for index, x in enumerate(outputs))
-    return outputs + list(torch.autograd.grad(loss, [x for x in tensors if x.requires_grad]))
+def one_of(values, *shape, seed=0):
+    return torch.tensor(values)[torch.randint(len(values), shape, generator=torch.Generator().manual_seed(seed))]
 
 
-def assert_exact_to_rounding(function, tensors, tolerance=2e-5):
-    """The native result lies within rounding of torch's in double precision."""
-    doubles = [x.double() if x.is_floating_point() else x for x in tensors]
-    for index, (ours, exact) in enumerate(zip(outputs_and_gradients(function, tensors),
-                                              outputs_and_gradients(function, doubles), strict=True)):
-        assert ours.dtype == torch.float32 and exact.dtype == torch.float64
-        assert (ours - exact).abs().max() <= tolerance * exact.abs().max().clamp_min(1), f'result {index}'
+class Batch(NamedTuple):
+    """What a network is called with."""
+
+    inputs: torch.Tensor
+    initial: torch.Tensor
+    episode_start: torch.Tensor
+    actions: torch.Tensor | None = None
 
 
-def gru(inputs, initial, start, *weights):
-    return networks.run([kernels.Step('gru', weights)], inputs, initial, start)
+def batch_for(network, L, C, rows, inputs, rows_at_gru, actions=None, seed=0):
+    return Batch(randoms(L, C, rows, inputs, seed=seed), randoms(C, rows_at_gru, network.hidden_size, seed=seed),
+                 uniform(L, C, seed=seed) < 0.2, actions)
 
 
-def gru_tensors(L, R, I, H):
-    weights = [randoms(3 * H, I) / I ** 0.5, randoms(3 * H, H, seed=1) / H ** 0.5, randoms(3 * H),
-               randoms(3 * H, seed=2)]
-    return [randoms(L, R, I), randoms(R, H), starts(L, R), *weights]
-
-
-@native
-@pytest.mark.parametrize('sizes', [(1, 1, 1, 1), (3, 2, 5, 7), (10, 49, 16, 16), (25, 7, 3, 33), (2, 101, 40, 64),
-                                   (5, 250, 18, 20), (40, 1, 8, 9), (2, 3, 300, 130)])
-def test_gru_and_all_its_gradients_equal_torch_in_double_precision(sizes):
-    assert_exact_to_rounding(gru, gru_tensors(*sizes))
-
-
-@native
-@pytest.mark.parametrize('rows', [1, 5, 48, 301])
-@pytest.mark.parametrize('sizes', [(1, 5), (18, 64), (33, 7), (300, 17)])
-@pytest.mark.parametrize('activation', ['identity', 'relu', 'tanh'])
-@pytest.mark.parametrize('norm', [False, True])
-def test_layer_and_all_its_gradients_equal_torch_in_double_precision(rows, sizes, activation, norm):
-    I, O = sizes
-    # Small integers make the sums before the activation exact, so that no rounding moves one across relu's edge.
-    x, weight = (randoms(rows, I) * 2).round(), (randoms(O, I) * 2).round()
-    parameters = [weight, torch.full((O,), 0.5), *([randoms(O), randoms(O, seed=1)] if norm else [])]
-
-    def layer(x, weight, bias, scale=None, shift=None):
-        return networks.run([kernels.Step(activation, (weight / 64, bias / 64, scale, shift))], x)
-
-    assert_exact_to_rounding(layer, [x, *parameters], 1e-4 if norm else 2e-5)
-
-
-@native
-@pytest.mark.parametrize('activation', ['identity', 'relu', 'tanh'])
-@pytest.mark.parametrize('width', [5, 8, 50])
-def test_norm_without_a_product_equals_torch(activation, width):
-    def layer(x, scale, shift):
-        return networks.run([kernels.Step(activation, (None, None, scale, shift))], x)
-
-    assert_exact_to_rounding(layer, [randoms(7, 9, width), randoms(width), randoms(width, seed=1)])
-
-
-def network_function(network):
-    """The network as a function of its inputs and parameters, in the precision of these; and parameters for it."""
-    names = [name for name, _ in network.named_parameters()]
-
-    def function(*tensors):
-        inputs, parameters = tensors[:-len(names)], tensors[-len(names):]
-        return torch.func.functional_call(network, dict(zip(names, parameters)), inputs)
-
-    return function, [randoms(*p.shape, seed=index) / p.shape[-1] ** (0.5 * (p.dim() - 1)) for index, p in
-                      enumerate(network.parameters())]
-
-
-@native
-@pytest.mark.parametrize('layers', [1, 2])
-def test_recurrent_network_equals_torch(layers):
-    network, parameters = network_function(networks.RecurrentNetwork(18, 5, 33, layers, 'tanh'))
-    assert_exact_to_rounding(network, [randoms(9, 20, 18), randoms(20, 33), starts(9, 20), *parameters], 1e-4)
-
-
-@native
-@pytest.mark.parametrize(('N', 'A', 'C'), [(3, 5, 50), (1, 4, 6), (2, 3, 5), (6, 5, 4)])
-def test_reward_network_equals_torch_with_and_without_its_table(N, A, C):
-    network, parameters = network_function(networks.PerAgentRewardNetwork(WorldSpec(N, A, 4, 11, False), 20))
-    actions = torch.randint(A, (4, C, N), generator=torch.Generator().manual_seed(3))
-    assert_exact_to_rounding(network, [randoms(4, C, 11), actions, randoms(C * N, 20), starts(4, C), *parameters], 1e-4)
-
-
-@pytest.mark.parametrize(('N', 'A', 'C'), [(3, 5, 50), (1, 4, 6), (2, 3, 9)])
-def test_table_of_the_others_actions_gives_what_each_agent_sees(N, A, C, monkeypatch):
-    network, parameters = network_function(networks.PerAgentRewardNetwork(WorldSpec(N, A, 4, 11, False), 20))
-    actions = torch.randint(A, (4, C, N), generator=torch.Generator().manual_seed(3))
-    tensors = [randoms(4, C, 11), actions, randoms(C * N, 20), starts(4, C), *parameters]
-    tensors = [x.double() if x.is_floating_point() else x for x in tensors]
-    with_table = outputs_and_gradients(network, tensors)
-    monkeypatch.setattr(networks, '_LOOK_UP_BELOW', 0)
-    for a, b in zip(with_table, outputs_and_gradients(network, tensors), strict=True):
-        torch.testing.assert_close(a, b)
-
-
-def bits(tensors):
-    return [x.detach().contiguous().view(torch.uint8).numpy().tobytes() for x in tensors]
-
-
-@native
-def test_same_bits_again_from_several_threads_at_once_and_at_any_address():
-    tensors = gru_tensors(5, 101, 19, 21)
-    expected = bits(outputs_and_gradients(gru, tensors))
-    with ThreadPoolExecutor(4) as pool:
-        for result in pool.map(lambda _: bits(outputs_and_gradients(gru, tensors)), range(16)):
-            assert result == expected
-    moved = [torch.empty(x.numel() + 3, dtype=x.dtype)[3:].view(x.shape).copy_(x) for x in tensors]
-    assert bits(outputs_and_gradients(gru, moved)) == expected
-
-
-@native
-def test_a_rows_bits_do_not_depend_on_the_rows_beside_it():
-    inputs, initial, start, *weights = gru_tensors(5, 101, 19, 21)
-    states = gru(inputs, initial, start, *weights)[0]
-    some = gru(inputs[:, 31:50], initial[31:50], start[:, 31:50], *weights)[0]
-    assert bits([states[:, 31:50]]) == bits([some])
-
-
-@native
-def test_same_bits_with_and_without_gradients():
-    network = networks.RecurrentNetwork(18, 5, 33, 2, 'relu')
-    for index, parameter in enumerate(network.parameters()):
-        parameter.data = randoms(*parameter.shape, seed=index) / 4
-    arguments = randoms(9, 20, 18), randoms(20, 33), starts(9, 20)
+def with_random_parameters(network, seed=0):
+    """The network, with no parameter at a value that would hide a mistake, as 0 and 1 do."""
     with torch.no_grad():
-        without = network(*arguments)
-    assert bits(without) == bits(network(*arguments))
+        for index, parameter in enumerate(network.parameters()):
+            parameter.copy_(randoms(*parameter.shape, seed=index + seed) / parameter.shape[-1] ** (0.5 * (parameter.dim() - 1)))
+    return network
+
+
+def double(value):
+    """The same in double precision: networks, tensors, and tuples with tensors in them."""
+    if isinstance(value, torch.nn.Module):
+        return copy.deepcopy(value).double()
+    if isinstance(value, torch.Tensor):
+        return value.double() if value.is_floating_point() else value
+    return type(value)(*map(double, value)) if isinstance(value, tuple) else value
+
+
+def exact_outputs(network, batch):
+    """In double precision, and how close what goes into a relu comes to where the slope jumps."""
+    distances = [math.inf]
+
+    def relu(x):
+        distances.extend(x.abs().flatten().tolist())
+        return torch.relu(x)
+
+    with torch.no_grad(), mock.patch.dict(networks._ACTIVATIONS, relu=relu):
+        return double(network)(*double(batch))[0], min(distances)
+
+
+def clear_of_jumps(make):
+    """(network, batch, its exact outputs) of the first seed for which rounding moves nothing across relu's edge."""
+    for seed in range(0, 10_000, 100):
+        network, batch = make(seed)
+        outputs, distance = exact_outputs(network, batch)
+        if distance > 3e-6:
+            return network, batch, outputs
+    raise AssertionError('no seed will do')
+
+
+def weights_for(outputs):
+    """Some of them zero, as for filling."""
+    L, C, *_ = outputs.shape
+    weights = (0.1 + uniform(L, C)) * one_of([0.0, 1.0, 1.0, 1.0], L, C)
+    weights[0] = 1
+    return weights
+
+
+def policy_loss(outputs, bonus=0.3):
+    """Of ratios within the clip range and far out of it, on both sides."""
+    actions = one_of(range(outputs.shape[-1]), *outputs.shape[:3], seed=3)
+    chosen = torch.log_softmax(outputs, -1).gather(-1, actions.unsqueeze(-1)).squeeze(-1)
+    log_ratios = one_of([-0.8, -0.15, 0.0, 0.12, 0.5], *chosen.shape, seed=4) + 0.03 * uniform(*chosen.shape)
+    return losses.PolicyLoss(actions, (chosen - log_ratios).float(), randoms(*chosen.shape, seed=5), weights_for(outputs), 0.2,
+                             bonus)
+
+
+def value_loss(outputs):
+    """Of values within the clip range and out of it, with errors within delta and beyond."""
+    values = outputs.flatten(1)
+    old = values + one_of([-0.7, -0.1, 0.0, 0.05, 0.6], *values.shape, seed=4)
+    targets = values + one_of([-3.0, -0.4, 0.3, 2.5], *values.shape, seed=5) + 0.03 * uniform(*values.shape)
+    return losses.ValueLoss(old.float(), targets.float(), weights_for(outputs), 0.2, 1.0, 0.5)
+
+
+def reward_loss(outputs):
+    L, C, N, A = outputs.shape
+    return losses.RewardLoss(one_of(range(A), L, C, N, seed=3), 2 * randoms(L, C, seed=4), weights_for(outputs))
+
+
+LOSSES = {'policy': policy_loss, 'no bonus': functools.partial(policy_loss, bonus=0.0), 'reward': reward_loss}
+
+
+def results(network, batch, loss):
+    """Outputs, states, each parameter's gradient and the loss's sums, by name."""
+    with torch.no_grad():
+        outputs, states = network(*batch)
+    flat, sums = network.gradient(loss, *batch)
+    named = dict(network.named_parameters())
+    gradients = flat.split([parameter.numel() for parameter in named.values()])
+    return {'outputs': outputs, 'sums': sums} | ({} if states is None else {'states': states}) | dict(zip(named, gradients))
+
+
+def assert_exact_to_rounding(network, batch, loss, tolerance=1e-4):
+    """What is native lies within rounding of torch's in double precision."""
+    assert kernels.usable(batch.inputs)
+    ours, exact = results(network, batch, loss), results(double(network), double(batch), double(loss))
+    largest = max(float(exact[name].abs().max()) for name, _ in network.named_parameters())
+    for name, right in exact.items():
+        assert ours[name].dtype == torch.float32 and right.dtype == torch.float64 and ours[name].shape == right.shape, name
+        scale = max(float(right.abs().max()), 0.01 * largest if name in dict(network.named_parameters()) else 1, 1e-3)
+        error = float((ours[name] - right).abs().max()) / scale
+        assert error <= tolerance, f'{name} is off by {error:.1e} of {scale:.1e}'
+
+
+class Row(networks.Network):
+    """Any row of steps, each given as the function that makes it and its arguments; actions are codes of the table."""
+
+    def __init__(self, *steps, hidden_size=0, table_rows=None):
+        super().__init__()
+        self.hidden_size, self._steps = hidden_size, steps
+        widths = [step.outputs for step in self.steps() if step.kind == 'fan_out']
+        self.table = torch.nn.Parameter(torch.empty(table_rows, *widths)) if widths else None
+        self.parts = torch.nn.ModuleList(part for step in steps for part in step if isinstance(part, torch.nn.Module))
+
+    def steps(self):
+        return [make(*arguments) for make, *arguments in self._steps]
+
+    def table_parameters(self):
+        return () if self.table is None else (self.table,)
+
+    def _table(self, actions):
+        return self.table, None if self.table is None or len(self.table) == actions.numel() else actions
+
+
+def activation_alone(width, activation):
+    return kernels.Step('layer', activation, width, width, (None,) * 4)
+
+
+Linear, Norm, Gru, layer, gru, fan_out = (torch.nn.Linear, torch.nn.LayerNorm, networks.Gru, networks.layer, networks.gru,
+                                          networks.fan_out)
+# Steps on inputs of width I, with outputs of width K.
+ROWS_OF_STEPS = {
+    'linear': lambda I, K: [(layer, Linear(I, K))],
+    'linear without a bias': lambda I, K: [(layer, Linear(I, K, bias=False))],
+    'linear, relu': lambda I, K: [(layer, Linear(I, K), 'relu')],
+    'linear, tanh': lambda I, K: [(layer, Linear(I, K), 'tanh')],
+    'linear, norm': lambda I, K: [(layer, Linear(I, K), 'identity', Norm(K))],
+    'linear, relu, norm': lambda I, K: [(layer, Linear(I, K), 'relu', Norm(K))],
+    'linear without a bias, tanh, norm': lambda I, K: [(layer, Linear(I, K, bias=False), 'tanh', Norm(K))],
+    'norm': lambda I, K: [(layer, None, 'identity', Norm(K))],
+    'relu, norm': lambda I, K: [(layer, None, 'relu', Norm(K))],
+    'tanh, norm': lambda I, K: [(layer, None, 'tanh', Norm(K))],
+    'norms and activations after a layer': lambda I, K: [
+        (layer, Linear(I, K)), (activation_alone, K, 'tanh'), (layer, None, 'identity', Norm(K)), (activation_alone, K, 'relu'),
+        (layer, None, 'tanh', Norm(K)), (activation_alone, K, 'identity')],
+    'GRU': lambda I, K: [(gru, Gru(I, K))],
+    'layer, GRU, layer': lambda I, K: [(layer, Linear(I, 9), 'tanh'), (gru, Gru(9, 21)), (layer, Linear(21, K))],
+    'fan-out': lambda I, K: [(fan_out, Norm(K))],
+    'layer, fan-out': lambda I, K: [(layer, Linear(I, K)), (fan_out, Norm(K))],
+    'layer, fan-out, GRU': lambda I, K: [(layer, Linear(I, 12), 'tanh'), (fan_out, Norm(12)), (gru, Gru(12, K))],
+    'GRU, fan-out, layer': lambda I, K: [(gru, Gru(I, 12)), (fan_out, Norm(12)), (layer, Linear(12, K))],
+}
+# L steps of C columns of N agents; I inputs, K outputs; K is also I where nothing changes the width.
+SIZES = [(1, 1, 1, 1, 1), (3, 2, 1, 5, 7), (10, 49, 1, 16, 16), (1, 301, 1, 33, 17), (2, 101, 3, 18, 64), (40, 1, 2, 8, 9),
+         (2, 5, 60, 3, 33), (1, 3, 1, 300, 130), (2, 4, 2, 20, 300), (5, 50, 5, 7, 24), (2, 2, 49, 31, 32)]
+
+
+def row_of_steps(kind, L, C, N, I, K, looked_up=False, seed=0):
+    steps = ROWS_OF_STEPS[kind](I, K)
+    made = [make(*arguments) for make, *arguments in steps]
+    I, fan_out_at = made[0].inputs, next((at for at, step in enumerate(made) if step.kind == 'fan_out'), len(made))
+    gru_at, hidden = next(((at, step.outputs) for at, step in enumerate(made) if step.kind == 'gru'), (0, 0))
+    rows = N if fan_out_at == len(made) else 1
+    network = with_random_parameters(Row(*steps, hidden_size=hidden, table_rows=11 if looked_up else L * C * N), seed)
+    codes = one_of(range(11), L, C, N, seed=seed) if looked_up else torch.zeros(L, C, N, dtype=torch.int64)
+    return network, batch_for(network, L, C, rows, I, N if gru_at > fan_out_at else rows, codes, seed)
 
 
 @native
-def test_tensors_in_any_layout_are_taken():
-    inputs, initial, start, *weights = gru_tensors(5, 30, 19, 21)
-    expected = bits(outputs_and_gradients(gru, [inputs, initial, start, *weights]))
-    strided = [x if x.dim() == 1 else x.transpose(0, 1).contiguous().transpose(0, 1)
-               for x in (inputs, initial, start, *weights)]
-    assert not strided[0].is_contiguous() and not strided[2].is_contiguous()
-    assert bits(outputs_and_gradients(gru, strided)) == expected
+@pytest.mark.parametrize('sizes', SIZES, ids=str)
+@pytest.mark.parametrize('kind', ROWS_OF_STEPS)
+def test_any_row_of_steps_and_its_gradients_equal_torch_in_double_precision(kind, sizes):
+    for looked_up in {False, 'fan-out' in kind}:
+        network, batch, outputs = clear_of_jumps(lambda seed: row_of_steps(kind, *sizes, looked_up, seed))
+        for make_loss in LOSSES.values():
+            assert_exact_to_rounding(network, batch, make_loss(outputs))
 
 
 @native
-def test_no_rows_give_no_outputs_and_zero_gradients():
-    inputs, initial, start, *weights = gru_tensors(5, 30, 19, 21)
-    states, *gradients = outputs_and_gradients(gru, [inputs[:, :0], initial[:0], start[:, :0], *weights])
-    assert states.shape == (5, 0, 21)
-    assert all(not gradient.any() for gradient in gradients)
-    network = networks.PerAgentRewardNetwork(WorldSpec(3, 5, 4, 11, False), 20)
-    predicted, _ = network(randoms(4, 0, 11), torch.zeros(4, 0, 3, dtype=torch.int64), randoms(0, 20), starts(4, 0))
-    assert predicted.shape == (4, 0, 3, 5)
+@pytest.mark.parametrize('sizes', [(1, 1, 1), (3, 70, 5), (25, 7, 33), (2, 301, 18)], ids=str)
+@pytest.mark.parametrize('kind', ['linear', 'norm', 'GRU', 'layer, GRU, layer'])
+def test_the_value_loss_of_a_row_of_steps_equals_torch_in_double_precision(kind, sizes):
+    L, C, I = sizes
+    network, batch, outputs = clear_of_jumps(lambda seed: row_of_steps(kind, L, C, 1, I, 1, seed=seed))
+    assert_exact_to_rounding(network, batch, value_loss(outputs))
 
 
 @native
-def test_gates_saturate_cleanly_and_a_nan_stays_visible():
-    inputs, initial, start, *weights = gru_tensors(3, 4, 5, 6)
-    states, gradient, *_ = outputs_and_gradients(gru, [inputs * 1e6, initial, start, *weights])
-    assert states.isfinite().all() and gradient.isfinite().all()
-    assert states.abs().max() <= initial.abs().max().clamp_min(1)
-    inputs[1, 2, 3] = torch.nan
-    states = gru(inputs, initial, start & False, *weights)[0]
-    assert states[1:, 2].isnan().any() and not states[:, :2].isnan().any() and not states[0].isnan().any()
+def test_a_value_within_the_clip_range_always_moves_however_the_difference_from_the_old_one_is_rounded():
+    network = with_random_parameters(Row((layer, Linear(3, 1, bias=False))))
+    batch = batch_for(network, 10, 400, 1, 3, 1)
+    batch = batch._replace(inputs=0.05 * batch.inputs)
+    values = exact_outputs(network, batch)[0].flatten(1)
+    old, targets = values + 0.19 * (2 * uniform(10, 400) - 1), values + randoms(10, 400)
+    assert_exact_to_rounding(network, batch, losses.ValueLoss(old.float(), targets.float(), torch.ones(10, 400), 0.2, 1.0, 0.5))
 
 
-def test_other_precisions_go_to_torch():
-    network = copy.deepcopy(networks.RecurrentNetwork(4, 2, 8, 1, 'relu')).double()
-    outputs, _ = network(randoms(2, 3, 4).double(), randoms(3, 8).double(), starts(2, 3))
-    assert outputs.dtype == torch.float64
+def recurrent_network(activation, layers, L, C, rows, outputs, seed=0):
+    network = with_random_parameters(networks.RecurrentNetwork(18, outputs, 33, layers, activation), seed)
+    return network, batch_for(network, L, C, rows, 18, rows, seed=seed)
+
+
+def actor(seed=0, L=7, C=33, N=3):
+    return recurrent_network('relu', 2, L, C, N, 5, seed)
+
+
+@native
+@pytest.mark.parametrize('sizes', [(9, 20, 3), (13, 50, 1), (1, 4, 51)], ids=str)
+@pytest.mark.parametrize('layers', [1, 2, 8])
+@pytest.mark.parametrize('activation', ['relu', 'tanh'])
+def test_actor_and_critic_and_their_gradients_equal_torch_in_double_precision(activation, layers, sizes):
+    L, C, N = sizes
+    network, batch, outputs = clear_of_jumps(functools.partial(recurrent_network, activation, layers, *sizes, 5))
+    assert_exact_to_rounding(network, batch, policy_loss(outputs))
+    network, batch, outputs = clear_of_jumps(functools.partial(recurrent_network, activation, layers, L, C * N, 1, 1))
+    assert_exact_to_rounding(network, batch, value_loss(outputs))
+
+
+def reward_network(architecture, N, A, C, L=5, hidden=20, seed=0):
+    network = with_random_parameters(networks.REWARD_NETWORKS[architecture](WorldSpec(N, A, 4, 11, False), hidden), seed)
+    batch = batch_for(network, L, C, 1, 11, network.states_per_world(), one_of(range(A), L, C, N, seed=seed), seed)
+    return network, batch._replace(inputs=network.inputs(batch.inputs.squeeze(2), batch.actions, batch.episode_start))
+
+
+ARCHITECTURES = pytest.mark.parametrize('architecture', networks.REWARD_NETWORKS)
+# N agents, A actions, C columns: with more to do for the others than the batch has rows, and with less.
+TEAMS = pytest.mark.parametrize(('N', 'A', 'C'), [(3, 5, 50), (1, 4, 6), (2, 3, 9), (6, 5, 4), (50, 2, 3), (3, 1, 5)])
+
+
+@native
+@ARCHITECTURES
+@TEAMS
+def test_reward_networks_and_their_gradients_equal_torch_in_double_precision(architecture, N, A, C):
+    network, batch, outputs = clear_of_jumps(lambda seed: reward_network(architecture, N, A, C, seed=seed))
+    assert_exact_to_rounding(network, batch, reward_loss(outputs))
+
+
+@ARCHITECTURES
+@pytest.mark.parametrize(('N', 'A', 'C'), [(3, 5, 50), (1, 4, 6), (2, 3, 9)])
+def test_table_of_the_others_actions_gives_what_each_agent_sees(architecture, N, A, C, monkeypatch):
+    network, batch = map(double, reward_network(architecture, N, A, C))
+    loss = reward_loss(network(*batch)[0].detach())
+    assert network._table(batch.actions)[1] is not None
+    with_table = results(network, batch, loss)
+    monkeypatch.setattr(networks, '_LOOK_UP_BELOW', 0)
+    assert network._table(batch.actions)[1] is None
+    torch.testing.assert_close(results(network, batch, loss), with_table)
+
+
+def examples():
+    """(network, batch, loss) of all kinds, each of several blocks and of odd sizes."""
+    made = [(*actor(), policy_loss), (*recurrent_network('tanh', 1, 11, 101, 1, 1), value_loss)]
+    made += [(*reward_network(architecture, *team), reward_loss) for architecture in networks.REWARD_NETWORKS
+             for team in ((3, 5, 50), (6, 5, 14))]
+    return [(network, batch, make_loss(exact_outputs(network, batch)[0])) for network, batch, make_loss in made]
+
+
+EXAMPLES = pytest.mark.parametrize('example', range(6), ids=[
+    'actor', 'critic', *(f'{name}, {how}' for name in networks.REWARD_NETWORKS for how in ('looked up', 'computed'))])
+
+
+@pytest.fixture(scope='module')
+def all_examples():
+    return examples()
+
+
+def bits(found):
+    return {name: x.detach().contiguous().numpy().tobytes() for name, x in found.items()}
+
+
+def changed(value, change):
+    """The tuple with `change` made to its tensors."""
+    return type(value)(*(change(part) if isinstance(part, torch.Tensor) else part for part in value))
+
+
+@native
+@EXAMPLES
+def test_same_bits_again_and_from_several_threads_at_once(all_examples, example):
+    expected = bits(results(*all_examples[example]))
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(lambda _: bits(results(*all_examples[example])), range(16)):
+            assert found == expected
+
+
+@native
+@EXAMPLES
+@pytest.mark.parametrize('offset', [1, 3, 16])
+def test_same_bits_at_any_address(all_examples, example, offset):
+    def moved(x):
+        return torch.empty(x.numel() + offset, dtype=x.dtype)[offset:].view(x.shape).copy_(x)
+
+    network, batch, loss = all_examples[example]
+    elsewhere = copy.deepcopy(network)
+    for parameter in elsewhere.parameters():
+        parameter.data = moved(parameter.data)
+    assert bits(results(elsewhere, changed(batch, moved), changed(loss, moved))) == bits(results(network, batch, loss))
+
+
+@native
+@EXAMPLES
+def test_tensors_in_any_layout_are_taken(all_examples, example):
+    def strided(x):
+        return x.transpose(0, 1).contiguous().transpose(0, 1)
+
+    network, batch, loss = all_examples[example]
+    assert not strided(batch.inputs).is_contiguous() and not strided(batch.episode_start).is_contiguous()
+    assert bits(results(network, changed(batch, strided), changed(loss, strided))) == bits(results(network, batch, loss))
+
+
+@native
+@EXAMPLES
+def test_what_a_column_gives_does_not_depend_on_the_columns_beside_it(all_examples, example):
+    network, batch, _ = all_examples[example]
+    with torch.no_grad():
+        outputs, states = network(*batch)
+        for some in (slice(3, 29), slice(1, 12)):
+            looked_up = batch.actions is not None and network._table(batch.actions[:, some])[1] is not None
+            if batch.actions is not None and looked_up != (network._table(batch.actions)[1] is not None):
+                continue  # the table is torch's product, of other sizes
+            part = Batch(batch.inputs[:, some], batch.initial[some], batch.episode_start[:, some],
+                         None if batch.actions is None else batch.actions[:, some])
+            for one, other in zip(network(*part), (outputs[:, some], states[:, some])):
+                assert torch.equal(one, other)
+
+
+@native
+def test_the_gradient_is_that_of_the_very_outputs_the_forward_pass_gives():
+    network, batch = recurrent_network('relu', 2, 9, 101, 1, 1)
+    with torch.no_grad():
+        values = network(*batch)[0].flatten(1)
+    gradient, sums = network.gradient(losses.ValueLoss(values, values, torch.ones(9, 101), 0.2, 1.0, 1.0), *batch)
+    assert not gradient.any() and not sums.any()
+
+
+@EXAMPLES
+def test_gradients_of_parts_of_a_batch_add_up_to_that_of_the_whole(all_examples, example):
+    network, batch, loss = all_examples[example]
+
+    def of(columns):
+        def cut(x):
+            return x[:, columns].contiguous()
+
+        part = changed(batch, cut)._replace(initial=batch.initial[columns])
+        return network.gradient(changed(loss, cut), *part)
+
+    C = batch.inputs.shape[1]
+    whole, parts = of(slice(0, C)), [of(slice(0, 5)), of(slice(5, C))]
+    for one, (first, second) in zip(whole, zip(*parts)):
+        torch.testing.assert_close(first + second, one, rtol=1e-4, atol=1e-4 * float(one.abs().max()))
+
+
+@EXAMPLES
+def test_a_gradient_leaves_no_trace_on_the_parameters(all_examples, example):
+    network, batch, loss = all_examples[example]
+    before = [parameter.detach().clone() for parameter in network.parameters()]
+    network.gradient(loss, *batch)
+    assert all(parameter.grad is None and torch.equal(parameter, old) for parameter, old in zip(network.parameters(), before))
+
+
+@EXAMPLES
+def test_without_columns_there_are_no_outputs_and_gradients_and_sums_are_zero(all_examples, example):
+    network, batch, loss = all_examples[example]
+    nothing = changed(batch, lambda x: x[:, :0])._replace(initial=batch.initial[:0])
+    found, whole = results(network, nothing, changed(loss, lambda x: x[:, :0])), results(network, batch, loss)
+    for name, x in whole.items():
+        assert found[name].shape == (x[:, :0].shape if name in ('outputs', 'states') else x.shape)
+        assert not found[name].any()
+
+
+@native
+@EXAMPLES
+def test_huge_inputs_saturate_cleanly(all_examples, example):
+    network, batch, loss = all_examples[example]
+    for scale in (1e6, 1e-6, 1e-30, 0.0):
+        found = results(network, batch._replace(inputs=batch.inputs * scale), loss)
+        assert all(x.isfinite().all() for x in found.values())
+        assert found['states'].abs().max() <= batch.initial.abs().max().clamp_min(1)
+
+
+def test_logits_that_are_all_but_certain_have_finite_gradients():
+    network = Row((layer, Linear(4, 4)))
+    with torch.no_grad():
+        network.parts[0].weight.copy_(torch.eye(4))
+        network.parts[0].bias.zero_()
+    inputs = 1e4 * randoms(3, 5, 1, 4)
+    loss = losses.PolicyLoss(inputs.argmax(-1), torch.zeros(3, 5, 1), randoms(3, 5, 1), torch.ones(3, 5), 0.2, 0.3)
+    gradient, sums = network.gradient(loss, inputs, torch.empty(5, 1, 0), torch.zeros(3, 5, dtype=torch.bool))
+    assert gradient.isfinite().all() and sums.isfinite().all()
+    assert sums[1] == pytest.approx(0, abs=1e-5)  # no entropy
+
+
+@EXAMPLES
+def test_a_nan_among_the_inputs_stays_visible_from_its_step_on_and_only_in_its_column(all_examples, example):
+    network, batch, loss = all_examples[example]
+    inputs = batch.inputs.clone()
+    inputs[2, 3] = torch.nan
+    poisoned = batch._replace(inputs=inputs, episode_start=torch.zeros_like(batch.episode_start))
+    found = results(network, poisoned, loss)
+    for name in ('outputs', 'states'):
+        assert found[name][2:, 3].isnan().flatten(2).any(-1).all()
+        assert not found[name][:2].isnan().any() and not found[name][:, :3].isnan().any() and not found[name][:, 4:].isnan().any()
+    assert found['sums'].isnan().any()
+    assert all(found[name].isnan().any() for name, _ in network.named_parameters())
+
+
+@EXAMPLES
+def test_a_nan_in_what_the_loss_compares_with_stays_visible_in_the_gradient(all_examples, example):
+    network, batch, loss = all_examples[example]
+    for name, part in loss._asdict().items():
+        if isinstance(part, torch.Tensor) and part.is_floating_point():
+            poisoned = part.clone()
+            poisoned[2, 3] = torch.nan
+            gradient, sums = network.gradient(loss._replace(**{name: poisoned}), *batch)
+            assert gradient.isnan().any() and sums.isnan().any(), name
+
+
+def test_other_precisions_go_to_torch(all_examples):
+    for example in all_examples:
+        assert all(x.dtype == torch.float64 for x in results(*map(double, example)).values())
+
+
+@native
+@EXAMPLES
+def test_without_the_kernels_torch_computes_the_same(all_examples, example, monkeypatch):
+    found = results(*all_examples[example])
+    monkeypatch.setattr(kernels, 'library', None)
+    fallback = results(*all_examples[example])
+    assert bits(fallback) != bits(found)
+    for name, x in found.items():
+        torch.testing.assert_close(fallback[name], x, rtol=1e-3, atol=1e-4 * float(x.abs().max()))
 
 
 ASK = 'import torch; from dae_ros.learning import kernels; print(kernels.available())'

@@ -818,14 +818,15 @@ static void policy_loss(long T, long N, long A, const Loss *loss, const float *l
         const float log_ratio = logits[action] - largest - log_sum - s->of_loss[0][row], ratio = expf(log_ratio);
         const float advantage = s->of_loss[1][row], weight = s->weights[row / N];
         const float free = ratio * advantage, held = fminf(fmaxf(ratio, 1 - clip), 1 + clip) * advantage;
-        const float push = free <= held ? free : 0; /* also within the clip range, where the two are one */
+        const int clipped_away = held < free; /* not within the clip range, where the two are one, nor for a NaN */
+        const float push = clipped_away ? 0 : free;
         const vec factor = all(weight / sum), above = all(entropy - log_sum);
         FOR_EACH_VECTOR(A, {
             vec slope = all(push) + all(bonus) * (load_upto(logits + j, lanes) - all(largest) + above);
             store_upto(grad + j, load_upto(grad + j, lanes) * factor * slope, lanes);
         });
         grad[action] -= push * weight;
-        surrogates -= (double)(fminf(free, held) * weight);
+        surrogates -= (double)((clipped_away ? held : free) * weight);
         entropies += (double)(entropy * weight);
         clipped += fabsf(ratio - 1) > clip ? (double)weight : 0;
         divergences -= (double)(log_ratio * weight);
@@ -847,11 +848,14 @@ static void value_loss(long T, const Loss *loss, const float *values, float *gra
     const float clip = (float)loss->numbers[0], delta = (float)loss->numbers[1], coefficient = (float)loss->numbers[2];
     for (long row = 0; row < T; row++) {
         const float old = s->of_loss[0][row], target = s->of_loss[1][row], weight = s->weights[row];
-        const float free = values[row] - target, held = old + fminf(fmaxf(values[row] - old, -clip), clip) - target;
+        const float moved = values[row] - old, held_move = moved > clip ? clip : moved < -clip ? -clip : moved;
+        const float free = values[row] - target;
+        const float held = held_move == moved ? free : old + held_move - target; /* or rounding could tell the two apart */
         const float of_free = huber(free, delta), of_held = huber(held, delta);
-        const int moves = !(of_held > of_free);
+        const int moves = of_free >= of_held;
+        const float slope = moves ? (free > delta ? delta : free < -delta ? -delta : free) : 0 * of_held; /* NaN if that is */
         sums[0] += (double)((moves ? of_free : of_held) * weight);
-        grad[row] = moves ? (free > delta ? delta : free < -delta ? -delta : free) * weight * coefficient : 0;
+        grad[row] = slope * weight * coefficient;
     }
 }
 
