@@ -79,10 +79,16 @@ def test_shards_cover_every_column_once_and_differ_by_one_column_at_most(columns
     assert min(sizes) >= 1 and max(sizes) - min(sizes) <= 1
 
 
+def test_two_cores_have_work_where_there_is_enough_of_it():
+    assert len(shard_bounds(32, 3)) == 2
+    assert len(shard_bounds(30, 3)) == 1
+    assert len(shard_bounds(320, 3, at_least=8)) == 8
+
+
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(columns=strategies.integers(1, 5000), rows=strategies.integers(1, 2000))
 def test_a_shard_is_neither_a_sliver_nor_larger_than_need_be(columns, rows):
     sizes = [(end - begin) * rows for begin, end in shard_bounds(columns, rows)]
     if len(sizes) > 1:
-        assert min(sizes) >= 100
+        assert min(sizes) >= 48 - rows
     assert max(sizes) <= max(500, 2 * rows)

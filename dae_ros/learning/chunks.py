@@ -11,7 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-SHARD_ROWS = 496  # most rows of a recurrent step in a shard: few shards, as starting one costs a millisecond
+MOST_ROWS = 496   # of a recurrent step in a shard: memory grows with them
+FEWEST_ROWS = 48  # in a shard: starting one costs as much as ten rows
 
 
 def to_chunks(sequences: Tensor, length: int) -> Tensor:
@@ -33,9 +34,14 @@ def first_states(states: Tensor, length: int) -> Tensor:
     return to_chunks(before, length)[0]
 
 
-def shard_bounds(columns: int, rows_per_column: int, at_least: int = 1) -> list[tuple[int, int]]:
-    """Splits `columns` chunks or worlds of `rows_per_column` rows each into near-equal runs of at most SHARD_ROWS rows,
-    or of a single column that is longer; into `at_least` so many."""
-    shards = max(at_least, -(-columns // max(1, SHARD_ROWS // rows_per_column)))
+def shard_bounds(columns: int, rows_per_column: int, at_least: int = 2) -> list[tuple[int, int]]:
+    """Splits `columns` chunks or worlds of `rows_per_column` rows each into near-equal runs.
+
+    They are `at_least` so many, so that as many cores have work, unless they had fewer than FEWEST_ROWS rows then; none has
+    more than MOST_ROWS rows but a run of a single column that is longer.
+    """
+    wanted = min(at_least, max(1, columns * rows_per_column // FEWEST_ROWS))
+    shards = max(wanted, -(-columns // max(1, MOST_ROWS // rows_per_column)))
+    shards = min(shards, max(1, columns))
     edges = [round(index * columns / shards) for index in range(shards + 1)]
     return list(zip(edges, edges[1:]))

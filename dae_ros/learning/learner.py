@@ -242,5 +242,7 @@ class Learner:
     def _shards(self, chunks: Chunks, initial: Tensor, rows_per_chunk: int) -> list[tuple[Chunks, Tensor]]:
         """The chunks of one gradient step in shards; their weights add up to one over the step."""
         chunks = chunks._replace(weights=chunks.weights / chunks.weights.sum())
-        return [(Chunks(*(part[:, a:b].contiguous() for part in chunks)), initial[a:b])
-                for a, b in shard_bounds(chunks.weights.shape[1], rows_per_chunk, 1 if self._team is None else self._team.size)]
+        processes = 1 if self._team is None else self._team.size
+        bounds = shard_bounds(chunks.weights.shape[1], rows_per_chunk, 2 * processes)
+        bounds += [(0, 0)] * (processes - len(bounds))  # for every process something, if only an empty shard
+        return [(Chunks(*(part[:, a:b].contiguous() for part in chunks)), initial[a:b]) for a, b in bounds]
