@@ -33,13 +33,14 @@ class Supervisor:
         self._processes: dict[str, subprocess.Popen] = {}
         log_folder.mkdir(parents=True, exist_ok=True)
 
-    def start(self, name: str, command: list[str], environment: Mapping[str, str]) -> None:
-        """Starts a process in a session of its own: Ctrl-C in the terminal reaches the supervisor alone."""
+    def start(self, name: str, command: list[str], environment: Mapping[str, str]) -> int:
+        """Starts a process in a session of its own: Ctrl-C in the terminal reaches the supervisor alone. Its process id."""
         with open(self.log_file(name), 'ab') as log:
             process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                                        start_new_session=True, preexec_fn=_end_with_parent)
         self._processes[name] = process
         threading.Thread(target=self._watch, args=(name, process), daemon=True).start()
+        return process.pid
 
     def log_file(self, name: str) -> Path:
         """Where the process's output goes."""

@@ -1,0 +1,156 @@
+"""Times training over the ROS graph beside the same training in one process, and says where the time goes.
+
+    python -m benchmarks.graph [--beta 0 0.95] [--robots 3] [--worlds 128] [--updates 30] [--rounds 3]
+
+Navigation, 25 steps a rollout, otherwise default settings. Graph and single process take turns, so that both meet the
+same disturbances; every number is the median of the rounds. Steps per second leave out the first updates, which warm up,
+and count everything else: collecting, learning, logs and checkpoints. A tick is one step of all worlds; its CPU
+milliseconds are those of the process's threads, DDS's among them, while a rollout is collected.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Sequence
+
+import rclpy
+from dae_ros_msgs.msg import TrainingStatus
+from rclpy.executors import SingleThreadedExecutor
+
+from dae_ros import config
+from dae_ros.config import Settings
+from dae_ros.report.metrics import STEPS, read_metrics
+from dae_ros.ros import names, qos
+from dae_ros.ros.graph import node_environment, training_graph
+from dae_ros.ros.supervisor import Supervisor
+from dae_ros.run_folder import RunFolder
+
+WARM_UP = 3      # updates
+TIMEOUT = 600.0  # s without any news of the graph
+
+
+def cpu_seconds(process: int) -> float:
+    """Processor time that a process has used, all its threads together."""
+    return time.clock_gettime(~process << 3 | 2)  # the clock that clock_getcpuclockid(3) gives
+
+
+def run_graph(settings: Settings, path: Path, updates: int) -> dict[str, float]:
+    """Trains over the graph for `updates` updates; CPU seconds per tick while collecting, by node."""
+    folder = RunFolder(path, settings)
+    codes: dict[str, int] = {}
+    supervisor = Supervisor(path / 'logs', codes.__setitem__)
+    processes: dict[str, int] = {}
+    used: Counter[str] = Counter()
+    before: dict[str, float] = {}
+    rollouts, newest = 0, 0
+
+    def hear(status: TrainingStatus) -> None:
+        nonlocal before, newest, rollouts
+        now = {name: cpu_seconds(process) for name, process in processes.items()}
+        if status.run != folder.run:
+            return
+        newest = status.policy_version
+        if before and status.state == TrainingStatus.LEARNING:
+            used.update({name: now[name] - before[name] for name in now})
+            rollouts += 1
+        before = now if status.state == TrainingStatus.COLLECTING and newest >= WARM_UP else {}
+
+    rclpy.init(args=[])
+    node = rclpy.create_node('benchmark', start_parameter_services=False)
+    node.create_subscription(TrainingStatus, names.TRAINING_STATUS, hear, qos.LATCHED_INPUT)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        for process in training_graph(settings, folder):
+            command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
+                       *process.arguments(folder.settings_file, '')]
+            processes[process.name] = supervisor.start(process.name, command, os.environ)
+        deadline = time.monotonic() + TIMEOUT
+        while newest < updates:
+            if codes or time.monotonic() > deadline:
+                raise RuntimeError(f'the graph stood still, exit codes {codes}; its logs are in {path / "logs"}')
+            executor.spin_once(timeout_sec=1.0)
+    finally:
+        supervisor.stop()
+        rclpy.try_shutdown()
+    return {name: seconds / rollouts / settings.run.num_steps for name, seconds in used.items()}
+
+
+def run_single_process(settings: Settings, path: Path) -> None:
+    """The same training in one process."""
+    path.mkdir()
+    task_file = path / 'task.yaml'
+    task_file.write_text(config.to_yaml(settings))
+    subprocess.run([sys.executable, '-m', 'dae_ros_nodes.bringup', str(task_file), '--in-process', '--run-folder',
+                    str(path / 'run')], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def timing(folder: Path) -> dict[str, float]:
+    """Steps per second and the milliseconds of a rollout's phases, from a run's metrics after the warm-up."""
+    metrics = read_metrics(folder / 'metrics.csv')
+    steps, seconds = metrics[STEPS], metrics[STEPS] / metrics['steps_per_second']
+    phases = {name: 1e3 * statistics.median(metrics[f'seconds/{name}'][WARM_UP:]) for name in ('collecting', 'learning')}
+    return {'steps_per_second': (steps[-1] - steps[WARM_UP - 1]) / (seconds[-1] - seconds[WARM_UP - 1]), **phases}
+
+
+def medians(rounds: Sequence[dict[str, float]]) -> dict[str, float]:
+    return {name: statistics.median(one[name] for one in rounds) for name in rounds[0]}
+
+
+def measure(betas: Sequence[float] = (0.0, 0.95), robots: int = 3, worlds: int = 128, updates: int = 30,
+            rounds: int = 3) -> dict:
+    """For each beta: `graph` and `single_process` (steps_per_second, collecting and learning in ms), their `ratio`,
+    and `cpu_ms_per_tick` by node."""
+    os.environ.update(node_environment())
+    results = {}
+    for beta in betas:
+        settings = config.from_flat({'num_agents': robots, 'num_worlds': worlds, 'beta': beta, 'evaluation_episodes': 0,
+                                     'total_steps': updates * worlds * config.RunSettings.num_steps})
+        graph, single, cpu = [], [], []
+        with tempfile.TemporaryDirectory() as scratch:
+            for turn in range(rounds):
+                cpu.append(run_graph(settings, Path(scratch, f'graph{turn}'), updates))
+                graph.append(timing(Path(scratch, f'graph{turn}')))
+                run_single_process(settings, Path(scratch, f'single{turn}'))
+                single.append(timing(Path(scratch, f'single{turn}', 'run')))
+        ratios = [one['steps_per_second'] / other['steps_per_second'] for one, other in zip(graph, single)]
+        results[f'{beta:g}'] = {'ratio': statistics.median(ratios), 'ratios': ratios, 'graph': medians(graph),
+                                'single_process': medians(single),
+                                'cpu_ms_per_tick': {name: 1e3 * seconds for name, seconds in medians(cpu).items()}}
+    return results
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--beta', type=float, nargs='+', default=[0.0, 0.95])
+    parser.add_argument('--robots', type=int, default=3)
+    parser.add_argument('--worlds', type=int, default=128)
+    parser.add_argument('--updates', type=int, default=30)
+    parser.add_argument('--rounds', type=int, default=3)
+    parser.add_argument('--json', action='store_true', help='print the numbers as JSON')
+    arguments = parser.parse_args()
+    results = measure(arguments.beta, arguments.robots, arguments.worlds, arguments.updates, arguments.rounds)
+    if arguments.json:
+        print(json.dumps(results, indent=2))
+        return
+    for beta, found in results.items():
+        print(f'beta {beta}: the graph at {found["ratio"]:.3f} of the single process '
+              f'({", ".join(f"{ratio:.3f}" for ratio in found["ratios"])})')
+        for name in ('graph', 'single_process'):
+            one = found[name]
+            print(f'  {name.replace("_", " "):16}{one["steps_per_second"]:8.0f} steps/s   collecting {one["collecting"]:6.1f} ms'
+                  f'   learning {one["learning"]:7.1f} ms')
+        print('  CPU per tick    ' + '   '.join(f'{name} {ms:.2f} ms' for name, ms in found['cpu_ms_per_tick'].items()))
+
+
+if __name__ == '__main__':
+    main()
