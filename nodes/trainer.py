@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 
 from dae_ros_msgs import msg
@@ -66,7 +67,8 @@ class TrainerNode(TeamNode):
         self.create_service(Trigger, names.PAUSE, self._on_pause)
         self.create_service(Trigger, names.RESUME, self._on_resume)
         self.create_service(Trigger, names.SAVE, self._on_save)
-        self._deadline = self.create_timer(settings.run.rollout_timeout, self._on_silence)
+        self._heard_at = 0.0  # of the rollout under way; s, monotonic
+        self.every(settings.run.rollout_timeout / 4, self._begin_anew_if_silent)
         self._publish_policy()
         self._advance()
 
@@ -92,7 +94,7 @@ class TrainerNode(TeamNode):
     def _ask(self) -> None:
         request = self._training.request()
         self._assembler.begin(request)
-        self._deadline.reset()
+        self._heard_at = time.monotonic()
         self._announce(Status.EVALUATING if self._training.evaluating else Status.COLLECTING, '')
         self._request.publish(convert.rollout_request_message(request))
 
@@ -119,7 +121,7 @@ class TrainerNode(TeamNode):
 
     def _collected(self) -> None:
         """Learns once the rollout is complete."""
-        self._deadline.reset()
+        self._heard_at = time.monotonic()
         if not self._assembler.complete:
             return
         trajectory = self._assembler.trajectory()
@@ -131,11 +133,12 @@ class TrainerNode(TeamNode):
             self._publish_policy()
         self._advance()
 
-    def _on_silence(self) -> None:
-        """Begins a rollout anew when nothing of it has come for too long."""
-        if self._state in (Status.COLLECTING, Status.EVALUATING):
-            self.get_logger().warning(f'nothing heard for {self._training.settings.run.rollout_timeout} s; missing: '
-                                      f'{self._assembler.missing()}; the rollout is begun anew')
+    def _begin_anew_if_silent(self) -> None:
+        """Begins a rollout anew when nothing of it has come for too long. A timer set anew by each message would cost more."""
+        timeout = self._training.settings.run.rollout_timeout
+        if self._state in (Status.COLLECTING, Status.EVALUATING) and time.monotonic() - self._heard_at >= timeout:
+            self.get_logger().warning(f'nothing heard for {timeout} s; missing: {self._assembler.missing()}; the rollout is '
+                                      'begun anew')
             self._advance()
 
     def _finish(self) -> None:

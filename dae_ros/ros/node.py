@@ -11,17 +11,24 @@ from typing import Any, Callable, Iterable
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from dae_ros.config import SettingInfo
 from dae_ros.errors import DaeRosError, Refused
 from dae_ros.ros import names, params, qos
 
+try:
+    from rclpy.experimental import EventsExecutor as Executor
+except ImportError:  # an older Jazzy: its executor builds a wait set of everything anew for each message
+    from rclpy.executors import SingleThreadedExecutor as Executor
+
 DIAGNOSTICS_PERIOD = 1.0  # s
+LONG = 3600.0  # s; without a limit this executor does not wait but spins
 
 
 class TeamNode(Node):
@@ -35,13 +42,15 @@ class TeamNode(Node):
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
         self.settings: dict[str, Any] = params.declare(self, declared)
         self.done = False
+        self.busy = False  # whether a callback is at work
+        self.failure: BaseException | None = None  # what a callback raised; ends the node
         self._refusals: Counter[tuple[str, str]] = Counter()
         self._diagnostics = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.EVENTS)
-        self.create_timer(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
+        self.every(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
 
     def publisher(self, kind: type, topic: str, profile: QoSProfile) -> Publisher:
         """A publisher whose partners coming and going call `on_matched`."""
-        callbacks = PublisherEventCallbacks(matched=lambda _: self.on_matched())
+        callbacks = PublisherEventCallbacks(matched=self._guarded(lambda _: self.on_matched()))
         return self.create_publisher(kind, topic, profile, event_callbacks=callbacks)
 
     def listen(self, kind: type, topic: str, profile: QoSProfile, handle: Callable[[Any], None]) -> Subscription:
@@ -52,8 +61,25 @@ class TeamNode(Node):
             except Refused as refusal:
                 self.refuse(topic, refusal)
 
-        callbacks = SubscriptionEventCallbacks(matched=lambda _: self.on_matched())
-        return self.create_subscription(kind, topic, receive, profile, event_callbacks=callbacks)
+        callbacks = SubscriptionEventCallbacks(matched=self._guarded(lambda _: self.on_matched()))
+        return self.create_subscription(kind, topic, self._guarded(receive), profile, event_callbacks=callbacks)
+
+    def every(self, period: float, act: Callable[[], None]) -> Timer:
+        """A timer that calls `act` each `period` seconds."""
+        return self.create_timer(period, self._guarded(act))
+
+    def _guarded(self, act: Callable[..., None]) -> Callable[..., None]:
+        """`act` as a callback whose error `run` raises: raised into the executor, it would also be logged as the executor's."""
+        def call(*arguments) -> None:
+            try:
+                self.busy = True
+                act(*arguments)
+            except BaseException as error:
+                self.failure = error
+            finally:
+                self.busy = False
+
+        return call
 
     def refuse(self, topic: str, refusal: Refused) -> None:
         """Counts a refused message; the first one for each topic and reason is also logged."""
@@ -88,18 +114,27 @@ def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int
 
     0: done or asked to stop. 2: a setting or the surroundings are wrong, told in one sentence. A bug shows its traceback.
     """
+    node = executor = None
+
+    def interrupt(number, frame) -> None:
+        """Ctrl-C breaks into our own callbacks, not into the executor's work; that stops by itself, as on SIGTERM."""
+        if node is None or node.busy:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)  # rclpy's handler, which shuts the context down, calls this one
     rclpy.init(args=args)
-    node = None
     try:
         node = make_node()
-        executor = SingleThreadedExecutor()
+        executor = Executor()
         executor.add_node(node)
         # What start-up made lives as long as the node. Unfrozen, the garbage collector goes through all of it again and
         # again, a quarter of an agent's time, since every message makes a few objects.
         gc.collect()
         gc.freeze()
-        while not node.done:
-            executor.spin_once()
+        while not node.done and node.context.ok():
+            executor.spin_once(LONG)
+            if node.failure is not None:
+                raise node.failure
         return 0
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
@@ -115,6 +150,8 @@ def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int
         # A terminal and a launch file each send their own Ctrl-C: the second must not break into the cleaning up.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
+        if executor is not None:
+            executor.shutdown()
         if node is not None:
             node.close()
             node.destroy_node()
