@@ -10,14 +10,29 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
+from numpy.random.bit_generator import ISeedSequence
+
+
+class _Key(ISeedSequence):
+    """A generator's key as what numpy seeds it from: given the key itself, numpy asks the system for a seed nobody uses."""
+
+    def __init__(self, digest: bytes):
+        self._words = np.frombuffer(digest, '<u8')
+
+    def generate_state(self, n_words, dtype=np.uint32):
+        return self._words
+
+
+def _digest(seed: int, purpose: str, indices: tuple[int, ...]) -> bytes:
+    name = f'{seed}/{purpose}/' + '/'.join(str(int(index)) for index in indices)
+    return hashlib.blake2b(name.encode(), digest_size=16).digest()
 
 
 def key(seed: int, purpose: str, *indices: int) -> int:
     """128-bit key of the draw named by `seed`, `purpose` and `indices`."""
-    name = f'{seed}/{purpose}/' + '/'.join(str(int(index)) for index in indices)
-    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=16).digest(), 'little')
+    return int.from_bytes(_digest(seed, purpose, indices), 'little')
 
 
 def generator(seed: int, purpose: str, *indices: int) -> np.random.Generator:
     """A generator of its own for the draw named by `seed`, `purpose` and `indices`."""
-    return np.random.Generator(np.random.Philox(key=key(seed, purpose, *indices)))
+    return np.random.Generator(np.random.Philox(_Key(_digest(seed, purpose, indices))))

@@ -56,7 +56,31 @@ class Policy:
             raise ValueError(f'these tensors are not a policy of {architecture}')
         self.architecture = architecture
         self.tensors = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in tensors.items()}
-        self._transposed = {name: np.ascontiguousarray(tensor.T) for name, tensor in self.tensors.items() if tensor.ndim == 2}
+        self._fold()
+
+    def _fold(self) -> None:
+        """Prepares one product for each layer: a LayerNorm's scale and shift go into the layer after it, and biases are
+        rows of the matrices, which a column of ones picks out of `_standardised`."""
+        H, exact = self.architecture.hidden_size, {name: tensor.astype(np.float64) for name, tensor in self.tensors.items()}
+
+        def after(norm: str, weight: np.ndarray, bias: np.ndarray) -> np.ndarray:
+            """[inputs + 1, outputs]: weight [outputs, inputs] and bias of a layer, behind the LayerNorm `norm`."""
+            return np.vstack([(weight * exact[f'{norm}.weight']).T, bias + weight @ exact[f'{norm}.bias']])
+
+        norms = ['input_norm', *(f'mlp_norm.{layer}' for layer in range(self.architecture.mlp_layers))]
+        layers = [after(norm, exact[f'mlp.{layer}.weight'], exact[f'mlp.{layer}.bias']) for layer, norm in enumerate(norms[:-1])]
+        # Of [x, 1, state]: reset and update gates with their signs turned, as the sigmoid needs them, then the candidate's
+        # part from the input and, apart from it, its part from the state, which the reset gate scales.
+        gru = np.zeros((2 * H + 1, 4 * H))
+        gru[:H + 1, :3 * H] = after(norms[-1], exact['gru.weight_ih'], exact['gru.bias_ih'])
+        from_state = np.concatenate([exact['gru.bias_hh'][None], exact['gru.weight_hh'].T])
+        gru[H:, :2 * H] += from_state[:, :2 * H]
+        gru[H:, 3 * H:] = from_state[:, 2 * H:]
+        gru[:, :2 * H] *= -1
+        self._layers = [layer.astype(np.float32) for layer in layers]
+        self._gru = gru.astype(np.float32)
+        self._averages = [np.full(size, 1 / size, np.float32) for size in (self.architecture.observation_size, H)]
+        self._head = np.ascontiguousarray(after('gru_norm', exact['head.weight'], exact['head.bias']).T, np.float32)
 
     def initial_state(self, num_worlds: int) -> np.ndarray:
         """Recurrent state before an episode: zeros [W, H]."""
@@ -68,48 +92,49 @@ class Policy:
         values: observations [W, O] float32. state: [W, H] float32. episode_start: [W] bool; the state is forgotten there.
         Returns ([W, A] float32 with rows that sum to 1, [W, H] float32).
         """
-        x = self._layer_norm('input_norm', values)
-        for layer in range(self.architecture.mlp_layers):
-            x = self._linear(f'mlp.{layer}', x)
-            x = np.maximum(x, 0, out=x) if self.architecture.activation == 'relu' else _tanh(x)
-            x = self._layer_norm(f'mlp_norm.{layer}', x)
-        state = self._gru(x, state * ~episode_start[:, None])
-        logits = self._linear('head', self._layer_norm('gru_norm', state))
-        logits -= logits.max(axis=1, keepdims=True)
-        probabilities = np.exp(logits, out=logits)
-        probabilities /= probabilities.sum(axis=1, keepdims=True)
-        return probabilities, state
-
-    def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
-        y = x @ self._transposed[f'{name}.weight']
-        y += self.tensors[f'{name}.bias']
-        return y
-
-    def _layer_norm(self, name: str, x: np.ndarray) -> np.ndarray:
-        centred = x - x.mean(axis=1, keepdims=True)
-        variance = np.einsum('ij,ij->i', centred, centred) / np.float32(x.shape[1])
-        centred *= (1 / np.sqrt(variance + LAYER_NORM_EPSILON))[:, None]
-        centred *= self.tensors[f'{name}.weight']
-        centred += self.tensors[f'{name}.bias']
-        return centred
-
-    def _gru(self, x: np.ndarray, state: np.ndarray) -> np.ndarray:
-        H = self.architecture.hidden_size
-        from_input = x @ self._transposed['gru.weight_ih'] + self.tensors['gru.bias_ih']
-        from_state = state @ self._transposed['gru.weight_hh'] + self.tensors['gru.bias_hh']
-        gates = _sigmoid(from_input[:, :2 * H] + from_state[:, :2 * H])
+        H, x, (average, hidden_average) = self.architecture.hidden_size, values, self._averages
+        for layer in self._layers:
+            x = _standardised(x, average) @ layer
+            x = np.maximum(x, 0, out=x) if self.architecture.activation == 'relu' else np.tanh(x, out=x)
+            average = hidden_average
+        x = _standardised(x, average, room=H)
+        remembered = x[:, H + 1:]
+        remembered[...] = state
+        remembered[episode_start] = 0
+        from_both = x @ self._gru
+        with np.errstate(over='ignore'):  # of a gate that is closed: 1 / (1 + inf) = 0
+            gates = np.exp(from_both[:, :2 * H])
+        gates += 1
+        np.reciprocal(gates, out=gates)
         reset, update = gates[:, :H], gates[:, H:]
-        candidate = _tanh(from_input[:, 2 * H:] + reset * from_state[:, 2 * H:])
-        return candidate + update * (state - candidate)
+        candidate = from_both[:, 3 * H:]
+        candidate *= reset
+        candidate += from_both[:, 2 * H:3 * H]
+        candidate = np.tanh(candidate)
+        state = remembered - candidate
+        state *= update
+        state += candidate
+        scores = self._head @ _standardised(state, average).T  # [A, W]: sums over actions along the worlds are the quicker ones
+        scores -= scores.max(axis=0)
+        np.exp(scores, out=scores)
+        scores /= scores.sum(axis=0)
+        return scores.T, state
 
 
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(np.clip(-x, -80, 80)))
+def _standardised(x: np.ndarray, average: np.ndarray, room: int = 0) -> np.ndarray:
+    """LayerNorm without scale and shift of x [W, I], then a column of ones, then `room` columns: [W, I + 1 + room].
 
-
-def _tanh(x: np.ndarray) -> np.ndarray:
-    """By way of exp, which numpy vectorises for float32 on every x86-64 and tanh only on some."""
-    return 1 - 2 / (np.exp(np.clip(2 * x, -80, 80)) + 1)
+    average: 1 / I [I]; numpy's own mean of short rows is slower than a product.
+    """
+    num_worlds, size = x.shape
+    y = np.empty((num_worlds, size + 1 + room), np.float32)
+    centred = x - (x @ average)[:, None]
+    deviation = (centred * centred) @ average
+    deviation += LAYER_NORM_EPSILON
+    np.sqrt(deviation, out=deviation)
+    np.divide(centred, deviation[:, None], out=y[:, :size])
+    y[:, size] = 1
+    return y
 
 
 def choose(probabilities: np.ndarray, greedy: bool, seed: int, rollout: int, step: int, robot: int) -> np.ndarray:
@@ -117,6 +142,6 @@ def choose(probabilities: np.ndarray, greedy: bool, seed: int, rollout: int, ste
     if greedy:
         return probabilities.argmax(axis=1).astype(np.uint16)
     uniforms = draws.generator(seed, 'action', rollout, step, robot).random(len(probabilities))
-    cumulative = probabilities.cumsum(axis=1, dtype=np.float64)
-    chosen = (cumulative <= (uniforms * cumulative[:, -1])[:, None]).sum(axis=1)
+    cumulative = probabilities.T.cumsum(axis=0, dtype=np.float64)
+    chosen = (cumulative <= uniforms * cumulative[-1]).sum(axis=0)
     return np.minimum(chosen, probabilities.shape[1] - 1).astype(np.uint16)
