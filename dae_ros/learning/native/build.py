@@ -26,12 +26,12 @@ class BuildError(Exception):
     """The library could not be compiled; says why."""
 
 
-def build(target: Path) -> None:
-    """Compiles the library to `target`, which appears whole or not at all. Raises BuildError."""
+def build(target: Path, *flags: str) -> None:
+    """Compiles the library to `target`, with more flags if given; it appears whole or not at all. Raises BuildError."""
     compiler = _compiler()
     tuning = '-march=native' if platform.machine() in ('x86_64', 'AMD64', 'i686') else '-mcpu=native'
     temporary = target.with_name(f'.{target.name}.{os.getpid()}')
-    command = [*compiler, *_FLAGS, tuning, str(SOURCE), '-o', str(temporary), '-lm']
+    command = [*compiler, *_FLAGS, tuning, *flags, str(SOURCE), '-o', str(temporary), '-lm']
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL)
         if result.returncode:

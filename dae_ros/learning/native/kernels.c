@@ -191,7 +191,14 @@ static long max(long a, long b) { return a > b ? a : b; }
 
 static long round_up(long n, long multiple) { return (n + multiple - 1) / multiple * multiple; }
 
-/* One allocation per call, handed out piece by piece; `measure` first adds up what the pieces need. */
+#if defined(__SANITIZE_ADDRESS__) /* the tests have it watch the ends of the pieces, too */
+#include <sanitizer/asan_interface.h>
+enum { GAP = 64 };
+#else
+enum { GAP = 0 };
+#endif
+
+/* One allocation per call, handed out piece by piece; a first round adds up what the pieces need. */
 typedef struct {
     char *base;
     size_t used;
@@ -199,7 +206,12 @@ typedef struct {
 
 static float *take(Arena *arena, long floats) {
     float *piece = arena->base ? (float *)(arena->base + arena->used) : NULL;
-    arena->used += (size_t)round_up(floats * 4, 64);
+    const size_t used = arena->used + (size_t)floats * 4;
+    arena->used = (size_t)round_up((long)used + GAP, 64);
+#if defined(__SANITIZE_ADDRESS__)
+    if (piece)
+        ASAN_POISON_MEMORY_REGION(arena->base + used, arena->used - used);
+#endif
     return piece;
 }
 
