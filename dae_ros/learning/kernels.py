@@ -9,6 +9,7 @@ threads run side by side.
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import warnings
 from typing import NamedTuple, Sequence
@@ -60,14 +61,19 @@ class _Step(ctypes.Structure):
     _fields_ += [('parameters', ctypes.c_void_p * 4), ('gradients', ctypes.c_void_p * 4)]
 
 
+class _Array(ctypes.Structure):
+    _fields_ = [('data', ctypes.c_void_p), ('step', ctypes.c_long), ('column', ctypes.c_long)]
+
+
 class _Batch(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_long) for name in ('length', 'columns', 'agents', 'rows', 'table_rows')]
-    _fields_ += [(name, ctypes.c_void_p) for name in ('inputs', 'initial', 'start', 'table', 'codes')]
+    _fields_ = [(name, ctypes.c_long) for name in ('length', 'columns', 'agents', 'rows')]
+    _fields_ += [(name, _Array) for name in ('inputs', 'start', 'codes')]
+    _fields_ += [(name, ctypes.c_void_p) for name in ('initial', 'table')]
 
 
 class _Loss(ctypes.Structure):
-    _fields_ = [('kind', ctypes.c_long), ('numbers', ctypes.c_double * 3), ('actions', ctypes.c_void_p),
-                ('data', ctypes.c_void_p * 2), ('weights', ctypes.c_void_p)]
+    _fields_ = [('kind', ctypes.c_long), ('numbers', ctypes.c_double * 3), ('actions', _Array), ('data', _Array * 2),
+                ('weights', _Array)]
 
 
 def _load() -> ctypes.CDLL | None:
@@ -111,9 +117,9 @@ def forward(steps: Sequence[Step], batch: Batch) -> tuple[Tensor, Tensor]:
     rows, rows_of_states = _rows(steps, batch)
     outputs = batch.inputs.new_empty(L, C, rows, steps[-1].outputs)
     states = batch.inputs.new_empty(L, C, rows_of_states, batch.initial.shape[-1] if rows_of_states else 0)
-    kept, taken = _batch(steps, batch)
-    _check(library.network_forward(_steps(steps, {}), len(steps), taken, outputs.data_ptr(), states.data_ptr()))
-    del kept
+    kept: list[Tensor] = []
+    _check(library.network_forward(_steps(steps, {}), len(steps), _batch(steps, batch, kept), outputs.data_ptr(),
+                                   states.data_ptr()))
     return outputs, states
 
 
@@ -131,15 +137,16 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
         offset += 4 * parameter.numel()
     grad_table = None if batch.table is None else torch.zeros_like(batch.table)
     sums = torch.zeros(_MOST_SUMS, dtype=torch.float64)
-    actions, weights, *data = kept = _contiguous((loss.actions, loss.weights, *loss.data))
+    kept: list[Tensor] = []
+    columns = batch.episode_start.shape
+    agents = (*columns, batch.num_agents)
     numbers = loss.numbers + (0.0,) * (3 - len(loss.numbers))
-    addresses = [_address(x) for x in data] + [None] * (2 - len(data))
-    terms = _Loss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _address(actions),
-                  (ctypes.c_void_p * 2)(*addresses), _address(weights))
-    kept_too, taken = _batch(steps, batch)
-    _check(library.network_gradient(_steps(steps, offsets), len(steps), taken, terms, _address(grad_table),
+    shape = agents if loss.kind == 'policy' else columns
+    data = [_array(x, shape, torch.float32, kept) for x in (*loss.data, None)[:2]]
+    terms = _Loss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _array(loss.actions, agents, torch.int64, kept),
+                  (_Array * 2)(*data), _array(loss.weights, columns, torch.float32, kept))
+    _check(library.network_gradient(_steps(steps, offsets), len(steps), _batch(steps, batch, kept), terms, _address(grad_table),
                                     sums.data_ptr()))
-    del kept, kept_too
     return flat, grad_table, sums.float()
 
 
@@ -162,25 +169,48 @@ def _steps(steps: Sequence[Step], gradients: dict[int, int]) -> ctypes.Array:
         entry.inputs, entry.outputs = step.inputs, step.outputs
         for place, parameter in enumerate(step.parameters):
             if parameter is not None:
-                address = parameter.data_ptr()
+                address = _dense(parameter, parameter.shape).data_ptr()
                 entry.parameters[place], entry.gradients[place] = address, gradients.get(address)
     return array
 
 
-def _batch(steps: Sequence[Step], batch: Batch) -> tuple[list[Tensor | None], _Batch]:
-    """The batch for a kernel, and the tensors that must live until it has been called."""
-    kept = _contiguous((batch.inputs, batch.initial, batch.episode_start, batch.table, batch.codes))
+def _batch(steps: Sequence[Step], batch: Batch, kept: list[Tensor]) -> _Batch:
+    """The batch for a kernel; what must live until that has been called is added to `kept`."""
     L, C = batch.episode_start.shape
-    table_rows = 0 if batch.table is None else len(batch.table)
-    return kept, _Batch(L, C, batch.num_agents, batch.inputs.shape[2], table_rows, *(_address(x) for x in kept))
+    N, R = batch.num_agents, batch.inputs.shape[2]
+    rows = _rows(steps, batch)[1]
+    initial = batch.initial.contiguous()
+    kept.append(initial)
+    arrays = (_array(batch.inputs, (L, C, R, steps[0].inputs), torch.float32, kept),
+              _array(batch.episode_start, (L, C), torch.bool, kept), _array(batch.codes, (L, C, N), torch.int64, kept))
+    table = None
+    if batch.table is not None:
+        kept.append(batch.table)
+        table = _dense(batch.table, (len(batch.table), batch.table.shape[1])).data_ptr()
+    return _Batch(L, C, N, R, *arrays, _dense(initial, (C, rows, initial.shape[-1])).data_ptr() if rows else None, table)
+
+
+def _dense(tensor: Tensor, shape: Sequence[int]) -> Tensor:
+    if tensor.dtype != torch.float32 or tensor.shape != torch.Size(shape) or not tensor.is_contiguous():
+        raise ValueError(f'{tensor.dtype} {tuple(tensor.shape)} where dense float32 {tuple(shape)} is needed')
+    return tensor
+
+
+def _array(tensor: Tensor | None, shape: Sequence[int], dtype: torch.dtype, kept: list[Tensor]) -> _Array:
+    """A tensor [L, C, ...]; copied only if what belongs to one step of a column does not lie together."""
+    if tensor is None:
+        return _Array(None, 0, 0)
+    if tensor.dtype != dtype or tensor.shape != torch.Size(shape):
+        raise ValueError(f'{tensor.dtype} {tuple(tensor.shape)} where {dtype} {tuple(shape)} is needed')
+    inner = math.prod(tensor.shape[2:])
+    if not tensor.numel() or not tensor[0, 0].is_contiguous() or any(stride % inner for stride in tensor.stride()[:2]):
+        tensor = tensor.contiguous()
+    kept.append(tensor)
+    return _Array(tensor.data_ptr(), *(stride // max(inner, 1) for stride in tensor.stride()[:2]))
 
 
 def _address(tensor: Tensor | None) -> int | None:
     return None if tensor is None else tensor.data_ptr()
-
-
-def _contiguous(tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
-    return [None if x is None else x.contiguous() for x in tensors]
 
 
 def _check(failed: int) -> None:

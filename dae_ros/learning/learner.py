@@ -100,9 +100,9 @@ class Learner:
                                                  settings.gae_lambda)
         estimated = team.unsqueeze(-1).expand(actions.shape)
         reward_states: list[Tensor] = []
-        reward_inputs = states[:-1].unsqueeze(2)
+        seen = reward_inputs = states[:-1].unsqueeze(2)
         if settings.beta > 0:
-            reward_inputs = self._reward[0].network.inputs(states[:-1], actions, episode_start[:-1])
+            reward_inputs = self._reward[0].network.inputs(seen, actions, episode_start[:-1])
             predicted, reward_states = self._predicted_rewards(reward_inputs, actions, episode_start[:-1])
             expected = advantages.expected_rewards(predicted, probabilities)
             estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
@@ -120,8 +120,9 @@ class Learner:
         chosen = probabilities.gather(-1, actions.unsqueeze(-1)).squeeze(-1).log()
         weights = torch.full_like(rewards, 1.0)
         cut = partial(to_chunks, length=L)
-        chunks = Chunks(cut(observations), cut(states[:-1].unsqueeze(2)), cut(reward_inputs), cut(episode_start[:-1]),
-                        cut(actions), cut(chosen), cut(advantages.normalized(estimated)), cut(rewards),
+        chunked = cut(seen)
+        chunks = Chunks(cut(observations), chunked, chunked if reward_inputs is seen else cut(reward_inputs),
+                        cut(episode_start[:-1]), cut(actions), cut(chosen), cut(advantages.normalized(estimated)), cut(rewards),
                         cut(normalized_values[:-1]), cut(self._value_norm.normalize(targets)), cut(weights))
         first = FirstStates(first_states(actor_states, L), first_states(critic_states[:-1], L),
                             [first_states(member, L) for member in reward_states])
@@ -245,4 +246,4 @@ class Learner:
         processes = 1 if self._team is None else self._team.size
         bounds = shard_bounds(chunks.weights.shape[1], rows_per_chunk, 2 * processes)
         bounds += [(0, 0)] * (processes - len(bounds))  # for every process something, if only an empty shard
-        return [(Chunks(*(part[:, a:b].contiguous() for part in chunks)), initial[a:b]) for a, b in bounds]
+        return [(Chunks(*(part[:, a:b] for part in chunks)), initial[a:b]) for a, b in bounds]

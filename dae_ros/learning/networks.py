@@ -184,7 +184,7 @@ class RewardNetwork(Network):
         self.joint_action = nn.Linear(hidden_size, hidden_size)
 
     def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
-        """What the network reads of a rollout [T, W, 1, I]: states [T, W, S], actions [T, W, N], episode_start [T, W]."""
+        """What the network reads of a rollout [T, W, 1, I]: states [T, W, 1, S], actions [T, W, N], episode_start [T, W]."""
         raise NotImplementedError
 
     def states_per_world(self) -> int:
@@ -222,7 +222,7 @@ class PerAgentRewardNetwork(RewardNetwork):
         self.head = nn.Linear(hidden_size, spec.num_actions)
 
     def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
-        return states.unsqueeze(2)
+        return states
 
     def states_per_world(self) -> int:
         return self.num_agents
@@ -253,7 +253,7 @@ class SharedTrunkRewardNetwork(RewardNetwork):
     def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
         taken = functional.one_hot(actions, self.num_actions).flatten(2).to(states.dtype)
         before = torch.cat([torch.zeros_like(taken[:1]), taken[:-1]]) * ~episode_start.unsqueeze(-1)
-        return torch.cat([states, before], -1).unsqueeze(2)
+        return torch.cat([states, before.unsqueeze(2)], -1)
 
     def states_per_world(self) -> int:
         return 1

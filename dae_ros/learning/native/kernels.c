@@ -398,16 +398,21 @@ typedef struct {
     float *gradients[4];
 } Step;
 
+/* An array [L, C, ...] whose steps and columns lie anywhere: how many [...] apart the ones and the others are. */
+typedef struct {
+    const void *data;
+    long step, column;
+} Array;
+
 /* L steps of C columns, which are worlds or pieces of their history, of N agents each. */
 typedef struct {
     long length, columns, agents;
     long rows;            /* of a column where the network begins: N, or 1 for the team as a whole */
-    long table_rows;      /* K */
-    const float *inputs;  /* [L, C, rows, inputs of the first step] */
+    Array inputs;         /* [L, C, rows, inputs of the first step] */
+    Array start;          /* [L, C] bytes; the state is zeroed before steps where this is not 0 */
+    Array codes;          /* [L, C, N] int64 rows of the table; NULL: a row after another, K = L C N */
     const float *initial; /* [C, rows at the GRU, H] state before the first step */
-    const uint8_t *start; /* [L, C] the state is zeroed before steps where this is not 0 */
     const float *table;   /* [K, O] what FAN_OUT adds */
-    const int64_t *codes; /* [L, C, N] in 0 .. K - 1, or NULL: one row after another, K = L C N */
 } Batch;
 
 /* One step at work on a block of `rows` rows per column and `count` rows in all. */
@@ -801,10 +806,10 @@ enum { POLICY = 0, VALUE = 1, REWARD = 2 };
 typedef struct {
     long kind;
     double numbers[3];
-    const int64_t *actions; /* [L, C, N] for POLICY and REWARD */
-    const float *data[2];   /* POLICY: old log-probabilities, advantages [L, C, N]. VALUE: old values, targets [L, C].
-                               REWARD: rewards [L, C] */
-    const float *weights;   /* [L, C] */
+    Array actions; /* [L, C, N] int64 for POLICY and REWARD */
+    Array data[2]; /* POLICY: old log-probabilities, advantages [L, C, N]. VALUE: old values, targets [L, C].
+                      REWARD: rewards [L, C] */
+    Array weights; /* [L, C] */
 } Loss;
 
 /* -surrogate (eq. 4) - bonus * entropy, on T rows of A logits; numbers: clip, bonus.
@@ -950,12 +955,22 @@ static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *ba
     return s;
 }
 
-/* Copies columns first .. first + columns of from[L, C, bytes of a column]; and back. */
-static void gather(long L, long C, long first, long columns, long bytes, const void *from, void *to) {
-    for (long t = 0; t < L; t++)
-        memcpy((char *)to + t * columns * bytes, (const char *)from + (t * C + first) * bytes, (size_t)(columns * bytes));
+/* Copies `columns` columns from `first` on, of `bytes` each step, to [L, columns, bytes]. */
+static void gather(const Array *from, long L, long first, long columns, long bytes, void *to) {
+    char *into = to;
+    for (long t = 0; t < L; t++) {
+        const char *source = (const char *)from->data + (t * from->step + first * from->column) * bytes;
+        if (from->column == 1) {
+            memcpy(into, source, (size_t)(columns * bytes));
+            into += columns * bytes;
+        } else {
+            for (long column = 0; column < columns; column++, source += from->column * bytes, into += bytes)
+                memcpy(into, source, (size_t)bytes);
+        }
+    }
 }
 
+/* The way back, to[L, C, bytes]. */
 static void scatter(long L, long C, long first, long columns, long bytes, const void *from, void *to) {
     for (long t = 0; t < L; t++)
         memcpy((char *)to + (t * C + first) * bytes, (const char *)from + t * columns * bytes, (size_t)(columns * bytes));
@@ -964,21 +979,22 @@ static void scatter(long L, long C, long first, long columns, long bytes, const 
 static void forward_block(const Step *steps, long count, const Batch *batch, long first, long columns, Work *works,
                           Scratch *s) {
     const long L = batch->length, C = batch->columns, N = batch->agents;
-    gather(L, C, first, columns, batch->rows * steps[0].inputs * (long)sizeof(float), batch->inputs, s->inputs);
+    gather(&batch->inputs, L, first, columns, batch->rows * steps[0].inputs * (long)sizeof(float), s->inputs);
     const float *x = s->inputs;
     for (long i = 0; i < count; i++) {
         const Step *step = steps + i;
         Work *work = works + i;
         work->count = L * columns * work->rows;
         if (step->kind == GRU) {
+            const uint8_t *flags = batch->start.data;
             uint8_t *start = s->start;
             for (long t = 0; t < L; t++)
                 for (long column = first; column < first + columns; column++, start += work->rows)
-                    memset(start, batch->start[t * C + column], (size_t)work->rows);
+                    memset(start, flags[t * batch->start.step + column * batch->start.column], (size_t)work->rows);
             gru_forward(L, columns * work->rows, step, work, x, batch->initial + first * work->rows * step->outputs, s);
         } else if (step->kind == FAN_OUT) {
-            if (batch->codes)
-                gather(L, C, first, columns, N * (long)sizeof(int64_t), batch->codes, s->codes);
+            if (batch->codes.data)
+                gather(&batch->codes, L, first, columns, N * (long)sizeof(int64_t), s->codes);
             else
                 for (long t = 0, row = 0; t < L; t++)
                     for (long at = (t * C + first) * N; at < (t * C + first + columns) * N; at++)
@@ -993,13 +1009,13 @@ static void forward_block(const Step *steps, long count, const Batch *batch, lon
 
 static void loss_of_block(const Batch *batch, long first, long columns, const Loss *loss, const Work *last, long outputs,
                           double *sums, Scratch *s) {
-    const long L = batch->length, C = batch->columns, N = batch->agents, size = (long)sizeof(float);
-    gather(L, C, first, columns, size, loss->weights, s->weights);
+    const long L = batch->length, N = batch->agents, size = (long)sizeof(float);
+    gather(&loss->weights, L, first, columns, size, s->weights);
     for (int i = 0; i < 2; i++)
-        if (loss->data[i])
-            gather(L, C, first, columns, loss->kind == POLICY ? N * size : size, loss->data[i], s->of_loss[i]);
-    if (loss->actions)
-        gather(L, C, first, columns, N * (long)sizeof(int64_t), loss->actions, s->actions);
+        if (loss->data[i].data)
+            gather(&loss->data[i], L, first, columns, loss->kind == POLICY ? N * size : size, s->of_loss[i]);
+    if (loss->actions.data)
+        gather(&loss->actions, L, first, columns, N * (long)sizeof(int64_t), s->actions);
     if (loss->kind == POLICY)
         policy_loss(last->count, N, outputs, loss, last->y, s->from_above, sums, s);
     else if (loss->kind == VALUE)
