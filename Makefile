@@ -2,7 +2,7 @@
 # PYTHON names the interpreter for .venv; without it, set-up takes the first suitable one it finds.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help build demo test bench-peers lint lock clean
+.PHONY: help build demo test bench bench-peers lint lock clean
 export PYTHON
 
 help:  ## list the targets
@@ -16,6 +16,9 @@ demo: build  ## train cooperative navigation over a ROS graph on this machine; A
 
 test: build  ## run every test; ARGS goes to pytest
 	@. scripts/env.sh && exec python -m pytest $(ARGS)
+
+bench: build  ## measure speeds and phases on this machine; ARGS names parts, such as scale
+	@. scripts/env.sh && exec python -m benchmarks $(ARGS)
 
 bench-peers: build  ## compare with BenchMARL, VMAS, JaxMARL and mpe2; ARGS='--jaxmarl /path/to/checkout --rounds 5'
 	@. scripts/env.sh && exec python -m benchmarks.peers $(ARGS)

@@ -129,6 +129,18 @@ def measure(betas: Sequence[float] = (0.0, 0.95), robots: int = 3, worlds: int =
     return results
 
 
+def as_text(beta: str, found: dict) -> str:
+    """What `measure` found for one beta, for people."""
+    lines = [f'beta {beta}: the graph at {found["ratio"]:.3f} of the single process '
+             f'({", ".join(f"{ratio:.3f}" for ratio in found["ratios"])})']
+    for name in ('graph', 'single_process'):
+        one = found[name]
+        lines.append(f'  {name.replace("_", " "):16}{one["steps_per_second"]:8.0f} steps/s'
+                     f'   collecting {one["collecting"]:6.1f} ms   learning {one["learning"]:7.1f} ms')
+    lines.append('  CPU per tick    ' + '   '.join(f'{name} {ms:.2f} ms' for name, ms in found['cpu_ms_per_tick'].items()))
+    return '\n'.join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--beta', type=float, nargs='+', default=[0.0, 0.95])
@@ -143,13 +155,7 @@ def main() -> None:
         print(json.dumps(results, indent=2))
         return
     for beta, found in results.items():
-        print(f'beta {beta}: the graph at {found["ratio"]:.3f} of the single process '
-              f'({", ".join(f"{ratio:.3f}" for ratio in found["ratios"])})')
-        for name in ('graph', 'single_process'):
-            one = found[name]
-            print(f'  {name.replace("_", " "):16}{one["steps_per_second"]:8.0f} steps/s   collecting {one["collecting"]:6.1f} ms'
-                  f'   learning {one["learning"]:7.1f} ms')
-        print('  CPU per tick    ' + '   '.join(f'{name} {ms:.2f} ms' for name, ms in found['cpu_ms_per_tick'].items()))
+        print(as_text(beta, found))
 
 
 if __name__ == '__main__':

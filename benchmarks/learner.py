@@ -4,48 +4,52 @@
 
 Navigation's sizes, 25 steps, default settings, random data. Native and torch take turns, so that both meet the same
 disturbances; the fastest turn counts. The peak is what torch's own product of two 512 x 512 matrices reaches on one
-core in the same minutes; `ideal` is the arithmetic of the products at that peak, on all the cores in use.
+core in the same minutes; the arithmetic counted is that of the matrix products a network needs and no other.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from typing import Callable, NamedTuple
+from typing import Any, Callable, NamedTuple
 
+import dae_ros_nodes  # noqa: F401  sets the threads of the numerical libraries, as for the nodes
 import numpy as np
 import torch
 
 from dae_ros import config
 from dae_ros.config import Settings
-from dae_ros.learning import kernels, networks
+from dae_ros.learning import kernels, losses, networks
 from dae_ros.learning.chunks import shard_bounds
 from dae_ros.learning.learner import Learner
 from dae_ros.types import Trajectory, WorldSpec
 
 STEPS = 25
+ARCHITECTURES = ('per_agent', 'shared_trunk')
 
 
 class Row(NamedTuple):
     """One line of the table."""
 
     name: str
-    flops: float                 # of the products, row by row; looking up shared rows saves some of them
+    flops: float
     cores: int
     work: Callable[[], object]
 
 
+# Operations of the products, forward and backward, for one step of one world; nobody needs the gradient of the input.
+
 def recurrent_flops(hidden: int, inputs: int, outputs: int, layers: int) -> float:
-    """Products of one row's forward and backward pass; nobody needs the gradient of the input."""
-    products = inputs * hidden + (layers - 1) * hidden**2 + 6 * hidden**2 + hidden * outputs
-    return 6 * products
+    first = 2 * inputs * hidden
+    return 2 * (first + 3 * ((layers - 1) * hidden**2 + 6 * hidden**2 + hidden * outputs))
 
 
-def reward_flops(spec: WorldSpec, hidden: int) -> float:
-    """The same for one agent's row of the reward network; the state's layers count once per world."""
-    world = 3 * hidden**2 + 2 * spec.state_size * hidden
-    own = 3 * (hidden**2 + 6 * hidden**2 + hidden * spec.num_actions)
-    return 2 * (world / spec.num_agents + own)
+def reward_flops(architecture: str, spec: WorldSpec, hidden: int) -> float:
+    N, A = spec.num_agents, spec.num_actions
+    gru, square, head = 6 * hidden**2, hidden**2, hidden * A
+    if architecture == 'per_agent':
+        return 2 * (2 * spec.state_size * hidden + 3 * square + 3 * N * (gru + head))
+    return 2 * (2 * (spec.state_size + N * A) * hidden + 3 * (gru + square) + 3 * N * (square + head))
 
 
 def random_trajectory(spec: WorldSpec, worlds: int) -> Trajectory:
@@ -60,50 +64,58 @@ def random_trajectory(spec: WorldSpec, worlds: int) -> Trajectory:
                       np.zeros((0, spec.state_size), np.float32))
 
 
-def epoch(network: torch.nn.Module, inputs: Callable[[int], tuple], chunks: int,
-          rows_per_chunk: int) -> Callable[[], None]:
-    """Forward and backward pass of `network` over all shards, with the sum of its outputs as the loss."""
-    parameters = tuple(network.parameters())
-    shards = [inputs(last - first) for first, last in shard_bounds(chunks, rows_per_chunk)]
+def epoch(network: networks.Network, rows: int, inputs: int, spec: WorldSpec, chunks: int, length: int) -> Callable[[], None]:
+    """Gradients of all shards of one pass over the batch."""
+    def shard(C: int) -> tuple:
+        L, N = length, spec.num_agents
+        actions, weights = torch.randint(spec.num_actions, (L, C, N)), torch.full((L, C), 1 / (L * C))
+        per_agent = torch.randn(2, L, C, N)
+        per_world = torch.randn(2, L, C)
+        if isinstance(network, networks.RewardNetwork):
+            loss = losses.RewardLoss(actions, per_world[0], weights)
+        elif rows == 1:
+            loss = losses.ValueLoss(*per_world, weights, 0.2, 10.0, 1.0)
+        else:
+            loss = losses.PolicyLoss(actions, *per_agent, weights, 0.2, 0.01)
+        states = network.states_per_world() if isinstance(network, networks.RewardNetwork) else rows
+        return (loss, torch.randn(L, C, rows, inputs), torch.zeros(C, states, network.hidden_size), torch.rand(L, C) < 1 / STEPS,
+                actions if isinstance(network, networks.RewardNetwork) else None)
+
+    shards = [shard(last - first) for first, last in shard_bounds(chunks, rows)]
 
     def work() -> None:
-        for shard in shards:
-            torch.autograd.grad(network(*shard)[0].sum(), parameters)
+        for arguments in shards:
+            network.gradient(*arguments)
 
     return work
 
 
 def rows(spec: WorldSpec, settings: Settings, worlds: int) -> list[Row]:
-    learner, L, N = settings.learner, settings.learner.chunk_length, spec.num_agents
+    learner, N = settings.learner, spec.num_agents
     H, R = learner.hidden_size, settings.reward_network.hidden_size
-    steps, chunks = worlds * STEPS, -(-worlds * STEPS // L)
-
-    def recurrent(width: int, per_chunk: int) -> Callable[[int], tuple]:
-        return lambda count: (torch.randn(L, count * per_chunk, width), torch.zeros(count * per_chunk, H),
-                              torch.rand(L, count * per_chunk) < 1 / STEPS)
-
-    def reward(count: int) -> tuple:
-        return (torch.randn(L, count, spec.state_size), torch.randint(spec.num_actions, (L, count, N)),
-                torch.zeros(count * N, R), torch.rand(L, count) < 1 / STEPS)
-
-    flops = {'actor': steps * N * recurrent_flops(H, spec.observation_size, spec.num_actions, learner.mlp_layers),
-             'critic': steps * recurrent_flops(H, spec.state_size, 1, learner.mlp_layers),
-             'reward network': steps * N * reward_flops(spec, R)}
-    actor, critic = networks.make_actor(spec, learner, 1), networks.make_critic(spec, learner, 1)
-    reward_network = networks.make_reward_network(spec, settings.reward_network, 1, 0)
-    works = {'actor': epoch(actor, recurrent(spec.observation_size, N), chunks, N),
-             'critic': epoch(critic, recurrent(spec.state_size, 1), chunks, 1),
-             'reward network': epoch(reward_network, reward, chunks, N)}
-    table = [Row(f'{name}, one epoch', flops[name], 1, work) for name, work in works.items()]
+    steps, chunks = worlds * STEPS, -(-worlds * STEPS // learner.chunk_length)
+    flops = {'actor': N * recurrent_flops(H, spec.observation_size, spec.num_actions, learner.mlp_layers),
+             'critic': recurrent_flops(H, spec.state_size, 1, learner.mlp_layers)}
+    flops |= {name: reward_flops(name, spec, R) for name in ARCHITECTURES}
+    made = {'actor': (networks.make_actor(spec, learner, 1), N, spec.observation_size),
+            'critic': (networks.make_critic(spec, learner, 1), 1, spec.state_size)}
+    for name in ARCHITECTURES:
+        reward_settings = config.from_flat({'reward_network.architecture': name}, settings).reward_network
+        width = spec.state_size + (N * spec.num_actions if name == 'shared_trunk' else 0)
+        made[name] = networks.make_reward_network(spec, reward_settings, 1, 0), 1, width
+    table = [Row(f'{name}, one epoch', steps * flops[name], 1,
+                 epoch(network, count, width, spec, chunks, learner.chunk_length))
+             for name, (network, count, width) in made.items()]
     trajectory = random_trajectory(spec, worlds)
-    for beta in (0.0, 0.95):
+    updates = {'beta 0': {'beta': 0.0}} | {f'beta 0.95, {a}': {'reward_network.architecture': a} for a in ARCHITECTURES}
+    for name, changes in updates.items():
         # An epoch is one forward and two backward products; values, states and predictions take one forward pass more.
-        passes = learner.epochs + 1 / 3
-        total = passes * (flops['actor'] + flops['critic'] + (flops['reward network'] if beta else 0))
+        needed = ['actor', 'critic', *(a for a in ARCHITECTURES if a in name)]
+        total = (learner.epochs + 1 / 3) * steps * sum(flops[network] for network in needed)
         for threads in (1, 2):
-            changed = config.from_flat({'beta': beta, 'learner_threads': threads}, settings)
+            changed = config.from_flat(changes | {'learner_threads': threads}, settings)
             one = Learner(spec, changed.learner, changed.reward_network, 1)
-            table.append(Row(f'update, beta {beta:g}, {threads} thread{"s" * (threads > 1)}', total, threads,
+            table.append(Row(f'update, {name}, {threads} thread{"s" * (threads > 1)}', total, threads,
                              lambda one=one: one.update(trajectory, 0)))
     return table
 
@@ -120,35 +132,49 @@ def matrix_peak() -> float:
     return 2 * 512**3 / min(seconds(lambda: matrix @ matrix) for _ in range(20))
 
 
+def measure(worlds: int = 128, robots: int = 3, repeats: int = 5) -> list[dict[str, Any]]:
+    """For each row: its name, GFLOP, milliseconds in torch and native, and the share of the peak the native one reaches."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    spec = WorldSpec(robots, 5, 6 * robots, 6 * robots * robots, True)
+    native = kernels.library
+    results = []
+    try:
+        for row in rows(spec, config.Settings(), worlds):
+            best = {'torch': float('inf'), 'native': float('inf')}
+            peak = 0.0
+            for turn in range(repeats + 1):
+                for name in best:
+                    kernels.library = native if name == 'native' else None
+                    taken = seconds(row.work)
+                    if turn:  # the first turn warms up
+                        best[name] = min(best[name], taken)
+                peak = max(peak, matrix_peak())
+            results.append({'name': row.name, 'gflop': row.flops / 1e9, 'peak_gflops_per_core': peak / 1e9,
+                            **{f'{name}_ms': 1e3 * taken for name, taken in best.items()},
+                            'of_peak': row.flops / peak / row.cores / best['native']})
+            print(as_text(results[-1]), flush=True)
+    finally:
+        kernels.library = native
+    return results
+
+
+def as_text(row: dict[str, Any]) -> str:
+    return (f'{row["name"]:42}{row["gflop"]:8.2f} GFLOP{row["torch_ms"]:10.1f} ms{row["native_ms"]:10.1f} ms'
+            f'{row["torch_ms"] / row["native_ms"]:8.2f}{row["of_peak"]:8.0%}'
+            f'   ({row["peak_gflops_per_core"]:.0f} GFLOP/s a core)')
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--worlds', type=int, default=128)
     parser.add_argument('--robots', type=int, default=3)
     parser.add_argument('--repeats', type=int, default=5)
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    N = arguments.robots
-    spec = WorldSpec(N, 5, 6 * N, 6 * N * N, True)
-    native = kernels.library
-    if native is None:
+    if not kernels.available():
         print('The native kernels are not available here; both columns show torch.')
-    print(f'{"":28}{"GFLOP":>8}{"torch":>10}{"native":>10}{"ideal":>10}{"speed-up":>10}{"of peak":>10}')
-    for row in rows(spec, config.Settings(), arguments.worlds):
-        best = {'torch': float('inf'), 'native': float('inf')}
-        peak = 0.0
-        for turn in range(arguments.repeats + 1):
-            for name in best:
-                kernels.library = native if name == 'native' else None
-                taken = seconds(row.work)
-                if turn:  # the first turn warms up
-                    best[name] = min(best[name], taken)
-            peak = max(peak, matrix_peak())
-        ideal = row.flops / peak / row.cores
-        print(f'{row.name:28}{row.flops / 1e9:8.2f}{best["torch"] * 1e3:8.1f}ms{best["native"] * 1e3:8.1f}ms'
-              f'{ideal * 1e3:8.1f}ms{best["torch"] / best["native"]:10.2f}{ideal / best["native"]:10.0%}'
-              f'   ({peak / 1e9:.0f} GFLOP/s a core)', flush=True)
-    kernels.library = native
+    print(f'{"":42}{"":14}{"torch":>13}{"native":>13}{"ratio":>8}{"of peak":>8}')
+    measure(arguments.worlds, arguments.robots, arguments.repeats)
 
 
 if __name__ == '__main__':

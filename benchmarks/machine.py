@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+QUIET = 0.1  # cores that other processes may keep busy on average during a measurement
 TICKS_PER_SECOND = os.sysconf('SC_CLK_TCK')
 
 

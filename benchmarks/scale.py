@@ -123,6 +123,14 @@ def plot(table: dict[str, dict[str, list[float]]], path: Path = PICTURE) -> None
     figure.savefig(path, dpi=150)
 
 
+def run() -> None:
+    """Measures, keeps and draws all."""
+    table = measure()
+    merge('scale', {'machine': description(), 'curves': table})
+    plot(table)
+    print(f'drawn in {PICTURE.relative_to(ROOT)}')
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--point', type=json.loads, help='measure one point with these settings, as JSON')
@@ -130,10 +138,7 @@ def main() -> None:
     if options.point is not None:
         print(json.dumps(point(options.point)))
         return
-    table = measure()
-    merge('scale', {'machine': description(), 'curves': table})
-    plot(table)
-    print(f'drawn in {PICTURE.relative_to(ROOT)}')
+    run()
 
 
 if __name__ == '__main__':

@@ -5,10 +5,9 @@ from __future__ import annotations
 from statistics import median
 from typing import Any, Mapping, NamedTuple
 
+from benchmarks.machine import QUIET
 from benchmarks.peers.contender import Block
 from benchmarks.peers.match import Comparison, Match
-
-QUIET = 0.1  # cores that other processes may keep busy on average during a turn
 
 
 class Row(NamedTuple):
