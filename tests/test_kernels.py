@@ -4,7 +4,6 @@ import copy
 import functools
 import math
 import os
-import shlex
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -338,15 +337,26 @@ def test_same_bits_at_any_address(all_examples, example, offset):
     assert bits(results(elsewhere, changed(batch, moved), changed(loss, moved))) == bits(results(network, batch, loss))
 
 
+LAYOUTS = {
+    'columns before steps': lambda x: x.transpose(0, 1).contiguous().transpose(0, 1),
+    'part of more columns': lambda x: torch.stack([x, x], 1).flatten(1, 2)[:, :x.shape[1]],
+    'every other column': lambda x: x.repeat_interleave(2, dim=1)[:, ::2],
+    'steps far apart': lambda x: x.repeat_interleave(3, dim=0)[::3],
+    'each number apart': lambda x: x.repeat_interleave(2, dim=-1)[..., ::2],
+    'last axis first': lambda x: x.movedim(-1, 0).contiguous().movedim(0, -1),
+}
+
+
 @native
 @EXAMPLES
-def test_tensors_in_any_layout_are_taken(all_examples, example):
-    def strided(x):
-        return x.transpose(0, 1).contiguous().transpose(0, 1)
+@pytest.mark.parametrize('layout', LAYOUTS)
+def test_tensors_in_any_layout_are_taken(all_examples, example, layout):
+    def laid_out(x):
+        return LAYOUTS[layout](x)
 
     network, batch, loss = all_examples[example]
-    assert not strided(batch.inputs).is_contiguous() and not strided(batch.episode_start).is_contiguous()
-    assert bits(results(network, changed(batch, strided), changed(loss, strided))) == bits(results(network, batch, loss))
+    assert not laid_out(batch.inputs).is_contiguous() and torch.equal(laid_out(batch.inputs), batch.inputs)
+    assert bits(results(network, changed(batch, laid_out), changed(loss, laid_out))) == bits(results(network, batch, loss))
 
 
 @native
@@ -407,6 +417,21 @@ def test_without_columns_there_are_no_outputs_and_gradients_and_sums_are_zero(al
     for name, x in whole.items():
         assert found[name].shape == (x[:, :0].shape if name in ('outputs', 'states') else x.shape)
         assert not found[name].any()
+
+
+@native
+@EXAMPLES
+def test_what_the_kernels_would_read_beyond_its_end_is_refused(all_examples, example):
+    network, batch, loss = all_examples[example]
+    wrong = [lambda x: x[:, :-1], lambda x: x[:-1], lambda x: x[..., :-1], lambda x: x.unsqueeze(0), lambda x: x.char()]
+    for call in (batch, loss):
+        for name, part in call._asdict().items():
+            for spoil in wrong if isinstance(part, torch.Tensor) else []:
+                if part is batch.actions and spoil(part).shape == part.shape:
+                    continue  # codes in the table are int64 whatever the actions are
+                spoilt = call._replace(**{name: spoil(part)})
+                with pytest.raises((ValueError, RuntimeError, IndexError)):
+                    results(network, spoilt if call is batch else batch, spoilt if call is loss else loss)
 
 
 @native
@@ -513,6 +538,7 @@ for network, batch, loss in tests['odd_shapes']():
 
 
 @native
+@pytest.mark.slow  # compiles, and Python under the sanitizer
 def test_nothing_is_read_or_written_beyond_its_end(compiled):
     try:
         library = compiled(*SANITIZERS)

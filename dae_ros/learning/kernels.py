@@ -114,9 +114,8 @@ def forward(steps: Sequence[Step], batch: Batch) -> tuple[Tensor, Tensor]:
     """Outputs [L, C, rows, K] of the last step, and the GRU's states [L, C, rows, H] after each step of time, which are
     empty if there is none."""
     L, C = batch.episode_start.shape
-    rows, rows_of_states = _rows(steps, batch)
-    outputs = batch.inputs.new_empty(L, C, rows, steps[-1].outputs)
-    states = batch.inputs.new_empty(L, C, rows_of_states, batch.initial.shape[-1] if rows_of_states else 0)
+    rows, *of_states = _rows(steps, batch)
+    outputs, states = batch.inputs.new_empty(L, C, rows, steps[-1].outputs), batch.inputs.new_empty(L, C, *of_states)
     kept: list[Tensor] = []
     _check(library.network_forward(_steps(steps, {}), len(steps), _batch(steps, batch, kept), outputs.data_ptr(),
                                    states.data_ptr()))
@@ -140,6 +139,9 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
     kept: list[Tensor] = []
     columns = batch.episode_start.shape
     agents = (*columns, batch.num_agents)
+    rows, outputs = _rows(steps, batch)[0], steps[-1].outputs
+    if (rows, outputs) != (1, 1) if loss.kind == 'value' else rows != batch.num_agents:
+        raise ValueError(f'no {loss.kind} loss of {rows} rows of {outputs} outputs for {batch.num_agents} agents')
     numbers = loss.numbers + (0.0,) * (3 - len(loss.numbers))
     shape = agents if loss.kind == 'policy' else columns
     data = [_array(x, shape, torch.float32, kept) for x in (*loss.data, None)[:2]]
@@ -150,15 +152,15 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
     return flat, grad_table, sums.float()
 
 
-def _rows(steps: Sequence[Step], batch: Batch) -> tuple[int, int]:
-    """Rows per column at the end and at the GRU (0: there is none)."""
-    rows, at_gru = batch.inputs.shape[2], 0
+def _rows(steps: Sequence[Step], batch: Batch) -> tuple[int, int, int]:
+    """Rows per column at the end and at the GRU, and its units (0 and 0: there is none)."""
+    rows, at_gru, units = batch.inputs.shape[2], 0, 0
     for step in steps:
         if step.kind == 'fan_out':
             rows = batch.num_agents
         elif step.kind == 'gru':
-            at_gru = rows
-    return rows, at_gru
+            at_gru, units = rows, step.outputs
+    return rows, at_gru, units
 
 
 def _steps(steps: Sequence[Step], gradients: dict[int, int]) -> ctypes.Array:
@@ -178,7 +180,9 @@ def _batch(steps: Sequence[Step], batch: Batch, kept: list[Tensor]) -> _Batch:
     """The batch for a kernel; what must live until that has been called is added to `kept`."""
     L, C = batch.episode_start.shape
     N, R = batch.num_agents, batch.inputs.shape[2]
-    rows = _rows(steps, batch)[1]
+    _, rows, units = _rows(steps, batch)
+    if R not in (1, N):
+        raise ValueError(f'inputs of {R} rows for {N} agents')
     initial = batch.initial.contiguous()
     kept.append(initial)
     arrays = (_array(batch.inputs, (L, C, R, steps[0].inputs), torch.float32, kept),
@@ -186,8 +190,9 @@ def _batch(steps: Sequence[Step], batch: Batch, kept: list[Tensor]) -> _Batch:
     table = None
     if batch.table is not None:
         kept.append(batch.table)
-        table = _dense(batch.table, (len(batch.table), batch.table.shape[1])).data_ptr()
-    return _Batch(L, C, N, R, *arrays, _dense(initial, (C, rows, initial.shape[-1])).data_ptr() if rows else None, table)
+        width = next(step.outputs for step in steps if step.kind == 'fan_out')
+        table = _dense(batch.table, (L * C * N if batch.codes is None else len(batch.table), width)).data_ptr()
+    return _Batch(L, C, N, R, *arrays, _dense(initial, (C, rows, units)).data_ptr() if rows else None, table)
 
 
 def _dense(tensor: Tensor, shape: Sequence[int]) -> Tensor:
