@@ -78,6 +78,8 @@ class LearnerSettings:
     huber_delta: float = setting(10.0, 'where the value loss turns from quadratic to linear, on normalised values',
                                  minimum=1e-6, maximum=1e6)
     max_gradient_norm: float = setting(10.0, 'gradients longer than this are shortened, per network', minimum=1e-6, maximum=1e9)
+    device: str = setting('auto', 'where the learner computes; auto takes the GPU if there is one and it is the faster',
+                          choices=('auto', 'cpu', 'cuda'))
     learner_threads: int = setting(0, 'processor threads of the learner; 0 takes all cores. The weights do not depend on it',
                                    minimum=0, maximum=1024)
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from dae_ros import config, torchrun
 from dae_ros.config import Settings
 from dae_ros.errors import DaeRosError
+from dae_ros.learning.device import chosen_device
 from dae_ros.learning.learner import Learner
 from dae_ros.types import Trajectory, WorldSpec
 
@@ -57,7 +58,8 @@ class LeadingLearner(Learner):
     """The learner of rank 0."""
 
     def __init__(self, spec: WorldSpec, settings: Settings, team: Team):
-        super().__init__(spec, settings.learner, settings.reward_network, settings.run.seed, team)
+        super().__init__(spec, settings.learner, settings.reward_network, settings.run.seed, team,
+                         chosen_device(spec, settings))
         self._team = team
         team.send({'settings': np.frombuffer(json.dumps(config.flatten(settings)).encode(), np.uint8),
                    'spec': np.array(spec, np.int64)})
@@ -77,7 +79,7 @@ def make_learner(spec: WorldSpec, settings: Settings) -> Learner:
     """The learner of this process, which leads a team if torchrun started several."""
     if torchrun.size() > 1:
         return LeadingLearner(spec, settings, Team())
-    return Learner(spec, settings.learner, settings.reward_network, settings.run.seed)
+    return Learner(spec, settings.learner, settings.reward_network, settings.run.seed, device=chosen_device(spec, settings))
 
 
 def help_to_learn() -> None:
@@ -87,8 +89,9 @@ def help_to_learn() -> None:
         first = team.receive()
         settings = config.from_flat(json.loads(first['settings'].tobytes()))
         *sizes, state_is_observations = first['spec'].tolist()
-        learner = Learner(WorldSpec(*sizes, bool(state_is_observations)), settings.learner, settings.reward_network,
-                          settings.run.seed, team)
+        spec = WorldSpec(*sizes, bool(state_is_observations))
+        learner = Learner(spec, settings.learner, settings.reward_network, settings.run.seed, team,
+                          chosen_device(spec, settings))
         while arrays := team.receive():
             learner.load_state(_named(arrays, 'state.'))
             learner.update(Trajectory(**_named(arrays, 'trajectory.')), int(arrays['rollout']))

@@ -53,9 +53,10 @@ class Learner:
     """Actor, critic and reward networks of one run, and how they learn."""
 
     def __init__(self, spec: WorldSpec, settings: LearnerSettings, reward_settings: RewardNetworkSettings, seed: int,
-                 team=None):
-        """`team`: the `distributed.Team` this process learns with, None to learn alone."""
+                 team=None, device: torch.device = torch.device('cpu')):
+        """`team`: the `distributed.Team` this process learns with, None to learn alone. `device`: where it computes."""
         self._team = team
+        self._device = device
         self._spec = spec
         self._settings = settings
         self._reward_settings = reward_settings
@@ -69,7 +70,7 @@ class Learner:
         self._value_norm = ValueNormalizer()
 
     def _adam(self, network, learning_rate: float) -> FlatAdam:
-        return FlatAdam(network, learning_rate, self._settings.adam_epsilon, self._settings.max_gradient_norm)
+        return FlatAdam(network.to(self._device), learning_rate, self._settings.adam_epsilon, self._settings.max_gradient_norm)
 
     @property
     def policy(self) -> Policy:
@@ -78,12 +79,12 @@ class Learner:
         architecture = PolicyArchitecture(self._spec.observation_size, self._spec.num_actions, settings.hidden_size,
                                           settings.mlp_layers, settings.activation)
         named = dict(self._actor.network.named_parameters())
-        return Policy(architecture, {name: named[name].detach().numpy().copy() for name in architecture.shapes()})
+        return Policy(architecture, {name: named[name].detach().cpu().numpy().copy() for name in architecture.shapes()})
 
     def update(self, trajectory: Trajectory, rollout: int) -> dict[str, float]:
         """Learn from one rollout. Returns the metrics of the update, by name."""
         observations, states, episode_start, actions, probabilities, rewards, terminated, truncated, final_states = (
-            torch.from_numpy(np.ascontiguousarray(part)) for part in trajectory)
+            torch.from_numpy(np.ascontiguousarray(part)).to(self._device) for part in trajectory)
         settings, L = self._settings, min(self._settings.chunk_length, rewards.numel())
         continues = (~(terminated | truncated)).float()
         metrics: dict[str, float] = {}
@@ -139,7 +140,7 @@ class Learner:
         """Everything the next update depends on, by name; views that change with the next update."""
         tensors = {'value_norm': self._value_norm.state().numpy()}
         for network, adam in self._networks().items():
-            tensors |= {f'{network}.{name}': tensor.numpy() for name, tensor in adam.state().items()}
+            tensors |= {f'{network}.{name}': tensor.cpu().numpy() for name, tensor in adam.state().items()}
         return tensors
 
     def load_state(self, tensors: Mapping[str, np.ndarray]) -> None:
@@ -168,7 +169,7 @@ class Learner:
             own = None if actions is None else actions[:, first:last]
             return network(inputs[:, first:last], initial, episode_start[:, first:last], own)
 
-        parts = self._workers.map(partial(of_worlds, *bounds) for bounds in shard_bounds(inputs.shape[1], rows))
+        parts = self._workers.map(partial(of_worlds, *bounds) for bounds in self._bounds(inputs.shape[1], rows, 2))
         return tuple(torch.cat(part, 1) for part in zip(*parts))
 
     def _values(self, states: Tensor, episode_start: Tensor, truncated: Tensor, final_states: Tensor):
@@ -176,7 +177,7 @@ class Learner:
         critic = self._critic.network
         outputs, hidden = self._forward(critic, 1, states.unsqueeze(2), episode_start)
         with torch.no_grad():
-            ongoing = torch.zeros(1, len(final_states), dtype=torch.bool)
+            ongoing = torch.zeros(1, len(final_states), dtype=torch.bool, device=self._device)
             final_values = critic(final_states[None, :, None], hidden[:-1][truncated], ongoing)[0].view(-1)
         return outputs.flatten(1), hidden, final_values
 
@@ -225,12 +226,13 @@ class Learner:
         """Gradient steps of one network; returns its metrics, averaged over the steps."""
         count, parts = chunks.weights.shape[1], self._settings.num_mini_batches
         whole = self._shards(chunks, initial, rows_per_chunk) if parts == 1 else None
-        totals, norms = torch.zeros(len(metric_names)), 0.0
+        totals, norms = torch.zeros(len(metric_names), device=self._device), 0.0
         for epoch in range(epochs):
             if whole is not None:
                 batches = [whole]
             else:
-                order = torch.from_numpy(draws.generator(self._seed, f'mini_batches {name}', rollout, epoch).permutation(count))
+                order = draws.generator(self._seed, f'mini_batches {name}', rollout, epoch).permutation(count)
+                order = torch.from_numpy(order).to(self._device)
                 batches = [self._shards(Chunks(*(part[:, chosen] for part in chunks)), initial[chosen], rows_per_chunk)
                            for chosen in order.chunk(parts)]
             for shards in batches:
@@ -244,6 +246,12 @@ class Learner:
         """The chunks of one gradient step in shards; their weights add up to one over the step."""
         chunks = chunks._replace(weights=chunks.weights / chunks.weights.sum())
         processes = 1 if self._team is None else self._team.size
-        bounds = shard_bounds(chunks.weights.shape[1], rows_per_chunk, 2 * processes)
+        bounds = self._bounds(chunks.weights.shape[1], rows_per_chunk, 2 * processes)
         bounds += [(0, 0)] * (processes - len(bounds))  # for every process something, if only an empty shard
         return [(Chunks(*(part[:, a:b] for part in chunks)), initial[a:b]) for a, b in bounds]
+
+    def _bounds(self, columns: int, rows_per_column: int, at_least: int) -> list[tuple[int, int]]:
+        """Shards for the threads; a GPU, which is parallel itself, gets the whole."""
+        if self._device.type == 'cuda':
+            return [(0, columns)]
+        return shard_bounds(columns, rows_per_column, at_least)

@@ -22,7 +22,8 @@ class FlatAdam:
             offset += parameter.numel()
         self._optimizer = torch.optim.Adam([self._flat], lr=learning_rate, eps=epsilon, fused=True)
         # Adam makes its moments at the first step; they are made here so that a checkpoint always has the same tensors.
-        self._optimizer.state[self._flat] = {'step': torch.zeros(()), 'exp_avg': torch.zeros_like(self._flat),
+        steps = torch.zeros((), device=self._flat.device)
+        self._optimizer.state[self._flat] = {'step': steps, 'exp_avg': torch.zeros_like(self._flat),
                                              'exp_avg_sq': torch.zeros_like(self._flat)}
 
     def step(self, gradient: Tensor) -> float:
