@@ -63,9 +63,13 @@ def test_filling_of_weight_0_changes_neither_loss_nor_gradient(length):
     values, old_values, targets = torch.randn(3, 7, 3, generator=generator, dtype=torch.float64)
     values.requires_grad_()
     weights = torch.ones(7, 3, dtype=torch.float64)
-    whole = losses.value_loss(values, old_values, targets, weights, 0.2, 10.0)
-    cut = losses.value_loss(*(to_chunks(part, length) for part in (values, old_values, targets, weights)), 0.2, 10.0)
-    torch.testing.assert_close(cut, whole)
+
+    def loss(cut):
+        value_loss = losses.ValueLoss(cut(old_values), cut(targets), cut(weights), 0.2, 10.0, 0.5)
+        return value_loss(cut(values)[..., None, None])
+
+    (cut, cut_sums), (whole, whole_sums) = loss(lambda part: to_chunks(part, length)), loss(lambda part: part)
+    torch.testing.assert_close((cut, cut_sums), (whole, whole_sums))
     torch.testing.assert_close(*(torch.autograd.grad(loss, values)[0] for loss in (cut, whole)))
 
 

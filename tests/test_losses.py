@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies
 
 from dae_ros.learning import losses
 
-SHAPE = (4, 3, 2)
+L, C, N, A = SHAPE = (4, 3, 2, 5)
 CASES = dict(seed=strategies.integers(0, 2**32), clip=strategies.floats(0, 1))
 
 
@@ -23,47 +23,69 @@ def some_weights(seed, *shape):
     return random.random(shape) * (random.random(shape) < 0.8)
 
 
+def some_actions(seed):
+    return np.random.default_rng(seed).integers(0, A, (L, C, N))
+
+
 def tensors(*arrays):
-    return [torch.tensor(array) for array in arrays]
+    return [torch.tensor(np.asarray(array)) for array in arrays]
+
+
+def log_softmax(logits):
+    return logits - np.log(np.exp(logits).sum(-1, keepdims=True))
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(**CASES)
-def test_the_policy_loss_is_the_negated_clipped_surrogate(seed, clip):
-    log_ratio, advantages = 0.5 * normal(seed, *SHAPE), normal(seed + 1, *SHAPE)
-    weights = some_weights(seed, *SHAPE)
-    by_hand = 0.0
-    for index in np.ndindex(*SHAPE):
-        ratio = math.exp(log_ratio[index])
-        clipped = min(max(ratio, 1 - clip), 1 + clip)
-        by_hand -= weights[index] * min(ratio * advantages[index], clipped * advantages[index])
-    loss = losses.policy_loss(*tensors(log_ratio, advantages, weights), clip)
-    assert float(loss) == pytest.approx(by_hand, rel=1e-11, abs=1e-11)
+@given(**CASES, entropy_coefficient=strategies.floats(0, 1))
+def test_the_policy_loss_is_the_negated_clipped_surrogate_less_the_entropy_bonus(seed, clip, entropy_coefficient):
+    logits, advantages, actions = normal(seed, *SHAPE), normal(seed + 1, L, C, N), some_actions(seed)
+    old, weights = normal(seed + 2, L, C, N) / 2 - math.log(A), some_weights(seed, L, C)
+    by_hand = np.zeros(4)
+    for index in np.ndindex(L, C, N):
+        log_probabilities = log_softmax(logits[index])
+        log_ratio = log_probabilities[actions[index]] - old[index]
+        ratio = math.exp(log_ratio)
+        surrogate = min(ratio * advantages[index], min(max(ratio, 1 - clip), 1 + clip) * advantages[index])
+        entropy = -sum(math.exp(log) * log for log in log_probabilities)
+        by_hand += weights[index[:2]] * np.array([-surrogate, entropy, abs(ratio - 1) > clip, -log_ratio])
+    loss = losses.PolicyLoss(*tensors(actions, old, advantages, weights), clip, entropy_coefficient)
+    differentiated, sums = loss(torch.tensor(logits))
+    assert sums.tolist() == pytest.approx(by_hand, rel=1e-11, abs=1e-11)
+    assert float(differentiated) == pytest.approx(by_hand[0] - entropy_coefficient * by_hand[1], rel=1e-11, abs=1e-11)
+    assert len(sums) == len(loss.sums) and not sums.requires_grad
 
 
 @pytest.mark.parametrize('ratio, advantage, pushed', [
     (1.0, 1.0, True), (1.0, -1.0, True), (1.5, 1.0, False), (0.5, -1.0, False), (1.5, -1.0, True), (0.5, 1.0, True)])
 def test_a_ratio_is_pushed_no_further_out_of_the_clip_range_but_always_back(ratio, advantage, pushed):
-    log_ratio = torch.tensor([math.log(ratio)], dtype=torch.float64, requires_grad=True)
-    loss = losses.policy_loss(log_ratio, *tensors([advantage], [2.0]), 0.2)
-    gradient, = torch.autograd.grad(loss, log_ratio)
-    assert float(gradient) == pytest.approx(-2.0 * advantage * ratio if pushed else 0.0)
+    logits = torch.tensor([[[[0.3, -0.2, 1.0]]]], dtype=torch.float64, requires_grad=True)
+    probabilities = torch.softmax(logits.detach(), -1).flatten()
+    old = probabilities[1].log() - math.log(ratio)
+    loss = losses.PolicyLoss(torch.tensor([[[1]]]), old.view(1, 1, 1), *tensors([[[advantage]]], [[2.0]]), 0.2, 0.0)
+    gradient, = torch.autograd.grad(loss(logits)[0], logits)
+    of_log_probability = -2.0 * advantage * ratio if pushed else 0.0
+    expected = of_log_probability * (torch.tensor([0.0, 1.0, 0.0]) - probabilities)
+    torch.testing.assert_close(gradient.flatten(), expected)
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
-@given(seed=strategies.integers(0, 2**32), actions=strategies.integers(1, 6))
-def test_the_entropy_bonus_is_the_weighted_entropy_of_each_distribution(seed, actions):
-    probabilities = np.random.default_rng(seed).dirichlet(np.ones(actions), SHAPE)
-    weights = some_weights(seed, *SHAPE)
-    by_hand = sum(weights[index] * -sum(p * math.log(p) for p in probabilities[index] if p > 0)
-                  for index in np.ndindex(*SHAPE))
-    bonus = losses.entropy_bonus(*tensors(np.log(probabilities + 1e-300), weights))
-    assert float(bonus) == pytest.approx(by_hand, rel=1e-9, abs=1e-9)
+@pytest.mark.parametrize('entropy_coefficient', [0.0, 0.25])
+def test_the_entropy_bonus_of_a_uniform_choice_is_the_logarithm_of_the_number_of_actions(entropy_coefficient):
+    actions = torch.zeros(2, 1, 1, dtype=torch.int64)
+    loss = losses.PolicyLoss(actions, torch.full((2, 1, 1), -math.log(5)), torch.zeros(2, 1, 1), torch.full((2, 1), 0.5), 0.2,
+                             entropy_coefficient)
+    differentiated, (surrogate, entropy, clipped, divergence) = loss(torch.full((2, 1, 1, 5), 7.0))
+    assert float(entropy) == pytest.approx(math.log(5))
+    assert float(differentiated) == pytest.approx(-entropy_coefficient * math.log(5))
+    assert surrogate == clipped == 0 and float(divergence) == pytest.approx(0, abs=1e-6)
 
 
-def test_the_entropy_of_a_uniform_choice_is_the_logarithm_of_the_number_of_actions():
-    bonus = losses.entropy_bonus(torch.full((2, 5), math.log(0.2)), torch.tensor([0.5, 0.5]))
-    assert float(bonus) == pytest.approx(math.log(5))
+def test_the_entropy_bonus_pushes_towards_a_uniform_choice_and_not_without_its_coefficient():
+    logits = torch.tensor(normal(1, *SHAPE), requires_grad=True)
+    loss = losses.PolicyLoss(*tensors(some_actions(1), np.zeros((L, C, N)), np.zeros((L, C, N)), np.ones((L, C))), 0.2, 0.5)
+    gradient, = torch.autograd.grad(loss(logits)[0], logits)
+    with torch.no_grad():
+        assert loss(logits - 0.1 * gradient)[1][1] > loss(logits)[1][1] + 0.01
+    assert not torch.autograd.grad(loss._replace(entropy_coefficient=0.0)(logits)[0], logits)[0].any()
 
 
 def huber(error, delta):
@@ -71,45 +93,64 @@ def huber(error, delta):
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(**CASES, delta=strategies.floats(0.1, 10))
-def test_the_value_loss_is_the_worse_huber_loss_of_moving_freely_and_within_the_clip_range(seed, clip, delta):
-    values, old_values, targets = 3 * normal(seed, 3, *SHAPE)
-    weights = some_weights(seed, *SHAPE)
+@given(**CASES, delta=strategies.floats(0.1, 10), coefficient=strategies.floats(0, 2))
+def test_the_value_loss_is_the_worse_huber_loss_of_moving_freely_and_within_the_clip_range(seed, clip, delta, coefficient):
+    values, old_values, targets = 3 * normal(seed, 3, L, C)
+    weights = some_weights(seed, L, C)
     by_hand = 0.0
-    for index in np.ndindex(*SHAPE):
+    for index in np.ndindex(L, C):
         value, old, target = values[index], old_values[index], targets[index]
         near = old + min(max(value - old, -clip), clip)
         by_hand += weights[index] * max(huber(value - target, delta), huber(near - target, delta))
-    loss = losses.value_loss(*tensors(values, old_values, targets, weights), clip, delta)
-    assert float(loss) == pytest.approx(by_hand, rel=1e-11, abs=1e-11)
+    loss = losses.ValueLoss(*tensors(old_values, targets, weights), clip, delta, coefficient)
+    differentiated, sums = loss(torch.tensor(values)[..., None, None])
+    assert sums.tolist() == pytest.approx([by_hand], rel=1e-11, abs=1e-11)
+    assert float(differentiated) == pytest.approx(coefficient * by_hand, rel=1e-11, abs=1e-11)
+    assert len(sums) == len(loss.sums) and not sums.requires_grad
+
+
+@pytest.mark.parametrize('value, target, pushed', [
+    (0.1, 1.0, -0.9), (0.1, -1.0, 1.0), (0.5, 1.0, 0.0), (-0.5, -1.0, 0.0), (0.5, -1.0, 1.0), (-0.5, 1.0, -1.0)])
+def test_a_value_is_pushed_no_further_out_of_the_clip_range_but_always_back_and_by_delta_at_most(value, target, pushed):
+    """From an old value of 0, with a clip of 0.2 and a delta of 1."""
+    values = torch.tensor([[[[value]]]], dtype=torch.float64, requires_grad=True)
+    loss = losses.ValueLoss(*tensors([[0.0]], [[target]], [[2.0]]), 0.2, 1.0, 0.5)
+    gradient, = torch.autograd.grad(loss(values)[0], values)
+    assert float(gradient) == pytest.approx(2.0 * 0.5 * pushed)
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(seed=strategies.integers(0, 2**32))
 def test_the_reward_loss_is_half_the_squared_error_of_the_action_taken(seed):
-    predicted, rewards, weights = normal(seed, *SHAPE, 5), normal(seed + 1, *SHAPE[:2]), some_weights(seed, *SHAPE[:2])
-    actions = np.random.default_rng(seed).integers(0, 5, SHAPE)
+    predicted, rewards, weights = normal(seed, *SHAPE), normal(seed + 1, L, C), some_weights(seed, L, C)
+    actions = some_actions(seed)
     by_hand = 0.0
-    for t, world, agent in np.ndindex(*SHAPE):
+    for t, world, agent in np.ndindex(L, C, N):
         error = predicted[t, world, agent, actions[t, world, agent]] - rewards[t, world]
         by_hand += 0.5 * weights[t, world] * error**2
-    loss = losses.reward_loss(*tensors(predicted, actions, rewards[..., None], weights[..., None]))
-    assert float(loss) == pytest.approx(by_hand, rel=1e-11, abs=1e-11)
+    loss = losses.RewardLoss(*tensors(actions, rewards, weights))
+    differentiated, sums = loss(torch.tensor(predicted))
+    assert float(differentiated) == pytest.approx(by_hand, rel=1e-11, abs=1e-11)
+    assert sums.tolist() == [float(differentiated)]
+    assert len(sums) == len(loss.sums) and not sums.requires_grad
 
 
-def losses_of(rows):
-    """Every loss on some of eight rows."""
-    values, old_values, targets, weights, *_ = tensors(*normal(1, 4, 8))
-    log_probabilities, predicted = torch.log_softmax(torch.tensor(normal(2, 8, 5)), -1), torch.tensor(normal(3, 8, 5))
-    actions = torch.arange(8) % 5
-    return torch.stack([
-        losses.policy_loss(values[rows], targets[rows], weights[rows], 0.2),
-        losses.entropy_bonus(log_probabilities[rows], weights[rows]),
-        losses.value_loss(values[rows], old_values[rows], targets[rows], weights[rows], 0.2, 10.0),
-        losses.reward_loss(predicted[rows], actions[rows], targets[rows], weights[rows]),
-    ])
+def losses_of(columns):
+    """Every loss, what is differentiated and its sums, of some of eight columns."""
+    random = np.random.default_rng(1)
+    logits, actions = random.normal(size=(L, 8, N, A)), random.integers(0, A, (L, 8, N))
+    parts = logits, actions, *random.normal(size=(2, L, 8, N)), *random.normal(size=(4, L, 8))
+    logits, actions, old, advantages, values, old_values, targets, weights = (part[:, columns] for part in tensors(*parts))
+    found = [losses.PolicyLoss(actions, old, advantages, weights, 0.2, 0.3)(logits),
+             losses.ValueLoss(old_values, targets, weights, 0.2, 1.0, 0.5)(values[..., None, None]),
+             losses.RewardLoss(actions, targets, weights)(logits)]
+    return torch.cat([torch.cat([differentiated.view(1), sums]) for differentiated, sums in found])
 
 
 def test_the_losses_of_shards_add_up_to_the_loss_of_the_batch():
-    rows = torch.arange(8)
-    torch.testing.assert_close(losses_of(rows[:3]) + losses_of(rows[3:7]) + losses_of(rows[7:]), losses_of(rows))
+    columns = torch.arange(8)
+    torch.testing.assert_close(losses_of(columns[:3]) + losses_of(columns[3:7]) + losses_of(columns[7:]), losses_of(columns))
+
+
+def test_a_loss_of_nothing_is_zero():
+    assert not losses_of(torch.arange(0)).any()

@@ -57,9 +57,9 @@ def test_robots_act_with_the_network_the_learner_trains(architecture):
     initial = np.random.default_rng(2).uniform(-1, 1, (9, architecture.hidden_size)).astype(np.float32)
     probabilities, states = act_through(policy_of(actor, architecture), values, episode_start, initial)
     with torch.no_grad():
-        logits, hidden = actor(*map(torch.from_numpy, (values, initial, episode_start)))
-    np.testing.assert_allclose(probabilities, torch.softmax(logits, -1).numpy(), rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(states, hidden.numpy(), rtol=1e-4, atol=2e-6)
+        logits, hidden = actor(*map(torch.from_numpy, (values[:, :, None], initial[:, None], episode_start)))
+    np.testing.assert_allclose(probabilities, torch.softmax(logits, -1).squeeze(2).numpy(), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(states, hidden.squeeze(2).numpy(), rtol=1e-4, atol=2e-6)
     assert probabilities.dtype == states.dtype == np.float32
     assert probabilities.std(axis=(0, 1)).min() > 0.01  # the comparison above is of something
 
