@@ -1,13 +1,15 @@
 """The networks: a GRU that is PyTorch's, a credit that ignores the agent's own action, and how all of them begin."""
 
+import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.learning.gru import gru_sequence
-from dae_ros.learning.networks import make_actor, make_critic, make_reward_network
+from dae_ros.learning.networks import REWARD_NETWORKS, make_actor, make_critic, make_reward_network
 from dae_ros.types import WorldSpec
 
 SPEC = WorldSpec(num_agents=3, num_actions=4, observation_size=5, state_size=9, state_is_observations=False)
@@ -76,76 +78,130 @@ def test_a_batch_without_rows_has_states_without_rows():
     assert states.shape == (1, 0, 4)
 
 
-def networks():
-    """Actor, critic and reward network, each as a function of part of its sequences, with rows and width of its GRU."""
-    actor, critic = make_actor(SPEC, LEARNER, 1), make_critic(SPEC, LEARNER, 1)
-    reward = make_reward_network(SPEC, REWARD, 1, 0)
-    states = normal(12, 6, SPEC.state_size)
-    values = normal(12, 6, SPEC.observation_size, seed=1)
-    actions = torch.randint(SPEC.num_actions, (12, 6, SPEC.num_agents), generator=torch.Generator().manual_seed(2))
-    return [
-        pytest.param(lambda a, b, *memory: actor(values[a:b], *memory), 6, LEARNER.hidden_size, id='actor'),
-        pytest.param(lambda a, b, *memory: critic(states[a:b], *memory), 6, LEARNER.hidden_size, id='critic'),
-        pytest.param(lambda a, b, *memory: reward(states[a:b], actions[a:b], *memory), 18, REWARD.hidden_size,
-                     id='reward network'),
-    ]
+def reward_network(architecture, seed=1, member=0):
+    return make_reward_network(SPEC, replace(REWARD, architecture=architecture), seed, member)
 
 
-@pytest.mark.parametrize('network, rows, hidden', networks())
-def test_a_sequence_cut_in_two_goes_on_from_the_state_of_the_first_part(network, rows, hidden):
+def some_actions(*shape, seed=2):
+    return torch.randint(SPEC.num_actions, (*shape, SPEC.num_agents), generator=torch.Generator().manual_seed(seed))
+
+
+def begin():
+    """Actor, critic and reward networks as they begin, by name."""
+    return {'actor': make_actor(SPEC, LEARNER, 1), 'critic': make_critic(SPEC, LEARNER, 1)} | {
+        f'{architecture} reward network': reward_network(architecture) for architecture in REWARD_NETWORKS}
+
+
+NETWORKS = pytest.mark.parametrize('name', begin())
+REWARDS = pytest.mark.parametrize('architecture', REWARD_NETWORKS)
+
+
+def sequences(name):
+    """A network as a function of a part of its sequences and what it remembers, and the shape of its memory."""
+    network, episode_start = begin()[name], torch.zeros(12, 6, dtype=torch.bool)
+    if name == 'actor':
+        inputs, actions, rows = normal(12, 6, SPEC.num_agents, SPEC.observation_size), None, SPEC.num_agents
+    else:
+        inputs, actions, rows = normal(12, 6, 1, SPEC.state_size), None, 1
+    if 'reward' in name:
+        actions, rows = some_actions(12, 6), network.states_per_world()
+        episode_start[5] = True
+        inputs = network.inputs(inputs, actions, episode_start)
+
+    def part(first, last, initial, episode_start):
+        return network(inputs[first:last], initial, episode_start, None if actions is None else actions[first:last])
+
+    return part, (6, rows, network.hidden_size)
+
+
+@NETWORKS
+def test_a_sequence_cut_in_two_goes_on_from_the_state_of_the_first_part(name):
+    network, memory = sequences(name)
     with torch.no_grad():
-        initial = normal(rows, hidden, seed=7)
+        initial = normal(*memory, seed=7)
         episode_start = starts(12, 6)
         outputs, states = network(0, 12, initial, episode_start)
         first, middle = network(0, 5, initial, episode_start[:5])
         second, last = network(5, 12, middle[-1], episode_start[5:])
-    assert outputs.shape[:2] == (12, 6) and states.shape == (12, rows, hidden)
+    assert outputs.shape[:2] == (12, 6) and states.shape == (12, *memory)
     torch.testing.assert_close(torch.cat([first, second]), outputs, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(torch.cat([middle, last]), states, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize('network, rows, hidden', networks())
-def test_an_episode_begins_without_memory_of_the_one_before(network, rows, hidden):
+@NETWORKS
+def test_an_episode_begins_without_memory_of_the_one_before(name):
+    network, memory = sequences(name)
     episode_start = torch.zeros(12, 6, dtype=torch.bool)
     episode_start[5] = True
     with torch.no_grad():
-        whole, _ = network(0, 12, normal(rows, hidden, seed=7), episode_start)
-        alone, _ = network(5, 12, torch.zeros(rows, hidden), torch.zeros(7, 6, dtype=torch.bool))
-        other, _ = network(0, 12, normal(rows, hidden, seed=7), torch.zeros(12, 6, dtype=torch.bool))
+        whole, _ = network(0, 12, normal(*memory, seed=7), episode_start)
+        alone, _ = network(5, 12, torch.zeros(memory), torch.zeros(7, 6, dtype=torch.bool))
+        other, _ = network(0, 12, normal(*memory, seed=7), torch.zeros(12, 6, dtype=torch.bool))
     torch.testing.assert_close(whole[5:], alone, rtol=1e-5, atol=1e-6)
     assert ((other[5] - whole[5]).abs() > 1e-4 * whole[5].abs().max()).any()
 
 
 def predictions(network, states, actions, episode_start):
+    """[T, W, N, A] for states [T, W, S], actions [T, W, N] and episode starts [T, W]."""
     with torch.no_grad():
-        initial = torch.zeros(actions.shape[1] * SPEC.num_agents, REWARD.hidden_size)
-        return network(states, actions, initial, episode_start)[0]
+        initial = torch.zeros(actions.shape[1], network.states_per_world(), REWARD.hidden_size)
+        inputs = network.inputs(states.unsqueeze(2), actions, episode_start)
+        return network(inputs, initial, episode_start, actions)[0]
 
 
-@pytest.mark.parametrize('agent', range(SPEC.num_agents))
-@pytest.mark.parametrize('when', [0, 3], ids=['past', 'current'])
-@pytest.mark.parametrize('worlds', [2, 40])
-def test_the_reward_predicted_for_an_agent_depends_on_the_others_actions_and_not_on_its_own(agent, when, worlds):
-    network = make_reward_network(SPEC, REWARD, 1, 0)
-    states, episode_start = normal(4, worlds, SPEC.state_size), torch.zeros(4, worlds, dtype=torch.bool)
-    actions = torch.zeros(4, worlds, SPEC.num_agents, dtype=torch.int64)
+def changes_of_the_last_prediction(network, worlds, agent, when, changed, episode_start):
+    """How much the last prediction for `agent` changes, per world, with each other action of `changed` at step `when`."""
+    states, actions = normal(4, worlds, SPEC.state_size), torch.zeros(4, worlds, SPEC.num_agents, dtype=torch.int64)
     before = predictions(network, states, actions, episode_start)
     assert before.shape == (4, worlds, SPEC.num_agents, SPEC.num_actions)
-    for changed in range(SPEC.num_agents):
-        for action in range(1, SPEC.num_actions):
-            other = actions.clone()
-            other[when, :, changed] = action
-            difference = (predictions(network, states, other, episode_start) - before)[3, :, agent].abs().amax(-1)
-            if changed == agent:
-                assert (difference < 1e-5).all()
-            else:
-                assert (difference > 1e-3).all()
+    for action in range(1, SPEC.num_actions):
+        other = actions.clone()
+        other[when, :, changed] = action
+        yield (predictions(network, states, other, episode_start) - before)[3, :, agent].abs().amax(-1)
 
 
-def test_the_reward_predicted_for_a_world_does_not_depend_on_how_many_worlds_there_are():
-    network = make_reward_network(SPEC, REWARD, 1, 0)
-    states, episode_start = normal(4, 60, SPEC.state_size), starts(4, 60)
-    actions = torch.randint(SPEC.num_actions, (4, 60, SPEC.num_agents), generator=torch.Generator().manual_seed(1))
+PAST, CURRENT = 0, 3
+
+
+@REWARDS
+@pytest.mark.parametrize('when', [PAST, CURRENT], ids=['past', 'current'])
+@pytest.mark.parametrize('worlds', [2, 40])
+def test_the_reward_predicted_for_an_agent_depends_on_the_others_actions_and_not_on_its_own(architecture, when, worlds):
+    """But a trunk shared by all agents has seen their earlier actions, the agent's own among them."""
+    network, episode_start = reward_network(architecture), torch.zeros(4, worlds, dtype=torch.bool)
+    for agent, changed in itertools.product(range(SPEC.num_agents), repeat=2):
+        seen = changed != agent or (architecture == 'shared_trunk' and when == PAST)
+        for difference in changes_of_the_last_prediction(network, worlds, agent, when, changed, episode_start):
+            assert (difference > 1e-3).all() if seen else (difference < 1e-5).all()
+
+
+@REWARDS
+@pytest.mark.parametrize('start', [1, 3])
+@pytest.mark.parametrize('worlds', [2, 40])
+def test_the_reward_predicted_does_not_depend_on_actions_of_an_earlier_episode(architecture, start, worlds):
+    network, episode_start = reward_network(architecture), torch.zeros(4, worlds, dtype=torch.bool)
+    episode_start[start, 1:] = True
+    for agent, changed in itertools.product(range(SPEC.num_agents), repeat=2):
+        for difference in changes_of_the_last_prediction(network, worlds, agent, start - 1, changed, episode_start):
+            assert (difference[1:] == 0).all()
+            assert difference[0] > 1e-4 or (architecture == 'per_agent' and changed == agent)
+
+
+@REWARDS
+def test_no_later_action_changes_a_prediction(architecture):
+    network, states, episode_start = reward_network(architecture), normal(4, 5, SPEC.state_size), starts(4, 5)
+    actions = some_actions(4, 5)
+    before = predictions(network, states, actions, episode_start)
+    for step in range(1, 4):
+        other = actions.clone()
+        other[step:] = (other[step:] + 1) % SPEC.num_actions
+        assert torch.equal(predictions(network, states, other, episode_start)[:step], before[:step])
+
+
+@REWARDS
+def test_the_reward_predicted_for_a_world_does_not_depend_on_how_many_worlds_there_are(architecture):
+    network = reward_network(architecture)
+    states, episode_start, actions = normal(4, 60, SPEC.state_size), starts(4, 60), some_actions(4, 60)
     together = predictions(network, states, actions, episode_start)
     for first in range(0, 60, 7):
         some = slice(first, first + 2)
@@ -153,8 +209,9 @@ def test_the_reward_predicted_for_a_world_does_not_depend_on_how_many_worlds_the
         torch.testing.assert_close(alone, together[:, some], rtol=1e-4, atol=1e-5)
 
 
-def test_the_reward_predicted_tells_the_agents_and_their_actions_apart():
-    network = make_reward_network(SPEC, REWARD, 1, 0)
+@REWARDS
+def test_the_reward_predicted_tells_the_agents_and_their_actions_apart(architecture):
+    network = reward_network(architecture)
     actions, episode_start = torch.zeros(1, 1, SPEC.num_agents, dtype=torch.int64), torch.ones(1, 1, dtype=torch.bool)
     predicted = predictions(network, normal(1, 1, SPEC.state_size), actions, episode_start)[0, 0]
     for one in range(SPEC.num_agents):
@@ -163,8 +220,9 @@ def test_the_reward_predicted_tells_the_agents_and_their_actions_apart():
     assert (predicted.std(1) > 1e-3).all()
 
 
-def test_the_reward_predicted_depends_on_the_state():
-    network = make_reward_network(SPEC, REWARD, 1, 0)
+@REWARDS
+def test_the_reward_predicted_depends_on_the_state(architecture):
+    network = reward_network(architecture)
     actions, episode_start = torch.zeros(1, 1, SPEC.num_agents, dtype=torch.int64), torch.ones(1, 1, dtype=torch.bool)
     states = (normal(1, 1, SPEC.state_size, seed=seed) for seed in (1, 2))
     one, other = (predictions(network, state, actions, episode_start) for state in states)
@@ -190,26 +248,32 @@ def test_actor_and_critic_begin_orthogonal_with_the_paper_s_gains(make, head_gai
             assert gain_of(parameter) == pytest.approx(gains[name.split('.')[0]], rel=1e-4), name
 
 
-def test_the_reward_network_begins_orthogonal_with_a_head_of_gain_1():
-    for name, parameter in make_reward_network(SPEC, REWARD, 1, 0).named_parameters():
+@REWARDS
+def test_the_reward_network_begins_orthogonal_with_a_head_of_gain_1(architecture):
+    for name, parameter in reward_network(architecture).named_parameters():
         if parameter.dim() == 2:
             expected = 1.0 if name.startswith(('gru', 'head')) else math.sqrt(2)
             assert gain_of(parameter) == pytest.approx(expected, rel=1e-4), name
 
 
-@pytest.mark.parametrize('network', [
-    make_actor(SPEC, LEARNER, 1), make_critic(SPEC, LEARNER, 1), make_reward_network(SPEC, REWARD, 1, 0)],
-    ids=['actor', 'critic', 'reward network'])
-def test_biases_begin_at_0_and_layer_norms_as_the_identity(network):
-    for name, parameter in network.named_parameters():
+@NETWORKS
+def test_biases_begin_at_0_and_layer_norms_as_the_identity(name):
+    for path, parameter in begin()[name].named_parameters():
         if parameter.dim() == 1:
-            scale = 'norm' in name and name.endswith('weight')
-            assert (parameter == (1.0 if scale else 0.0)).all(), name
+            scale = 'norm' in path and path.endswith('weight')
+            assert (parameter == (1.0 if scale else 0.0)).all(), path
+
+
+@NETWORKS
+def test_the_parameters_a_table_depends_on_are_the_network_s_first(name):
+    network = begin()[name]
+    for one, other in zip(network.table_parameters(), network.parameters()):
+        assert one is other
 
 
 def test_the_actor_begins_close_to_uniform():
     with torch.no_grad():
-        logits, _ = make_actor(SPEC, LEARNER, 1)(normal(8, 50, 5), torch.zeros(50, 16), starts(8, 50))
+        logits, _ = make_actor(SPEC, LEARNER, 1)(normal(8, 50, 3, 5), torch.zeros(50, 3, 16), starts(8, 50))
     assert (torch.softmax(logits, -1) - 1 / SPEC.num_actions).abs().max() < 0.02
 
 
@@ -220,7 +284,7 @@ def flat(network):
 def test_a_network_begins_as_its_seed_and_its_name_say_and_nothing_else():
     def make(seed):
         return [make_actor(SPEC, LEARNER, seed), make_critic(SPEC, LEARNER, seed),
-                *(make_reward_network(SPEC, REWARD, seed, member) for member in range(2))]
+                *(reward_network(architecture, seed, member) for architecture in REWARD_NETWORKS for member in range(2))]
 
     first = [flat(network) for network in make(1)]
     torch.manual_seed(7)
@@ -228,7 +292,7 @@ def test_a_network_begins_as_its_seed_and_its_name_say_and_nothing_else():
     for one, again, other in zip(first, make(1), make(2)):
         assert torch.equal(one, flat(again))
         assert not torch.equal(one, flat(other))
-    assert not torch.equal(first[2], first[3])
+    assert not torch.equal(first[2], first[3]) and not torch.equal(first[4], first[5])
     same_sizes = WorldSpec(3, 1, 9, 9, False)
     actor, critic = make_actor(same_sizes, LEARNER, 1), make_critic(same_sizes, LEARNER, 1)
     assert not torch.equal(actor.mlp[0].weight, critic.mlp[0].weight)
