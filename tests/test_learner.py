@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.learning.learner import Learner
+from dae_ros.learning.networks import REWARD_NETWORKS, RewardNetwork
 from dae_ros.learning.policy import choose
 from dae_ros.types import Trajectory, WorldSpec
 from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint, encode_policy
@@ -17,6 +18,8 @@ from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint, encode_p
 SPEC = WorldSpec(num_agents=3, num_actions=4, observation_size=5, state_size=7, state_is_observations=False)
 LEARNER = LearnerSettings(hidden_size=8, epochs=2, beta=0.9, learner_threads=1)
 REWARD = RewardNetworkSettings(hidden_size=12, epochs=2)
+SHARED_TRUNK = replace(REWARD, architecture='shared_trunk')
+REWARDS = pytest.mark.parametrize('reward_settings', [REWARD, SHARED_TRUNK], ids=['per agent', 'shared trunk'])
 
 # Adam's first step is learning_rate * g / (|g| + epsilon): with an epsilon of 1 the weights show the gradient itself.
 PLAIN = replace(LEARNER, epochs=1, adam_epsilon=1.0, learning_rate=1.0)
@@ -115,18 +118,31 @@ def head(states, p):
     return linear(layer_norm(states, p, 'gru_norm'), p, 'head')
 
 
+def joined(seen, actions, agent, num_actions, p):
+    """What an agent's prediction is made from: all agents' one-hot actions with its own block zero, and what is seen."""
+    others = functional.one_hot(actions, num_actions).double()
+    others[:, :, agent] = 0
+    acted = torch.relu(others.flatten(2) @ p['action_embedding'] + p['action_bias'])
+    both = torch.cat([p['joint_action.weight'], p['joint_state.weight']], 1)
+    return layer_norm(torch.relu(torch.cat([acted, seen], -1) @ both.t() + p['joint_action.bias']), p, 'joint_norm')
+
+
 def predicted_rewards(states, actions, num_actions, p, start, cut):
-    """[T, W, N, A]: for each agent, all agents' one-hot actions with its own block zero, and the state."""
-    predictions = []
-    for agent in range(actions.shape[-1]):
-        others = functional.one_hot(actions, num_actions).double()
-        others[:, :, agent] = 0
-        acted = torch.relu(others.flatten(2) @ p['action_embedding'] + p['action_bias'])
+    """[T, W, N, A]."""
+    agents = range(actions.shape[-1])
+    if 'trunk.weight' not in p:
         seen = layer_norm(torch.relu(linear(states, p, 'state')), p, 'state_norm')
-        both = torch.cat([p['joint_action.weight'], p['joint_state.weight']], 1)
-        joint = torch.relu(torch.cat([acted, seen], -1) @ both.t() + p['joint_action.bias'])
-        predictions.append(head(memories(layer_norm(joint, p, 'joint_norm'), p, start, cut), p))
-    return torch.stack(predictions, 2)
+        return torch.stack([head(memories(joined(seen, actions, agent, num_actions, p), p, start, cut), p)
+                            for agent in agents], 2)
+    taken = functional.one_hot(actions, num_actions).double().flatten(2)
+    before = torch.zeros_like(taken)
+    for t, world in np.ndindex(*start.shape):
+        if not start[t, world]:
+            before[t, world] = taken[t - 1, world]
+    trunk = layer_norm(torch.relu(linear(torch.cat([states, before], -1), p, 'trunk')), p, 'trunk_norm')
+    remembered = layer_norm(memories(trunk, p, start, cut), p, 'gru_norm')
+    hidden = [torch.relu(linear(joined(remembered, actions, agent, num_actions, p), p, 'hidden')) for agent in agents]
+    return torch.stack([linear(layer_norm(x, p, 'hidden_norm'), p, 'head') for x in hidden], 2)
 
 
 def adam_step(p, loss, max_norm):
@@ -226,18 +242,23 @@ CASES = {
     'one robot': {'agents': 1, 'worlds': 10},
     'two robots and many worlds': {'agents': 2, 'worlds': 40},
     'six robots': {'agents': 6},
+    'a shared trunk': {'architecture': 'shared_trunk'},
+    'a shared trunk, chunks over the ends of worlds': {'architecture': 'shared_trunk', 'chunk_length': 5},
+    'a shared trunk, many worlds, an ensemble': {'architecture': 'shared_trunk', 'worlds': 150, 'ensemble': 2},
+    'a shared trunk, six robots': {'architecture': 'shared_trunk', 'agents': 6},
+    'a shared trunk, one robot': {'architecture': 'shared_trunk', 'agents': 1, 'worlds': 10},
 }
 
 
 @pytest.mark.parametrize('case', CASES.values(), ids=CASES)
 def test_an_update_is_the_paper_s_formulas_step_by_step(case, make_learner):
     case = dict(case)
-    ensemble, worlds = case.pop('ensemble', 1), case.pop('worlds', 3)
+    ensemble, worlds, architecture = case.pop('ensemble', 1), case.pop('worlds', 3), case.pop('architecture', 'per_agent')
     spec = SPEC._replace(num_agents=case.pop('agents', SPEC.num_agents))
     settings = replace(PLAIN, **case)
     trajectory = random_trajectory(worlds=worlds, spec=spec, seed=3)
     assert trajectory.truncated.any() and trajectory.terminated.any()
-    learner = make_learner(settings, replace(PLAIN_REWARD, ensemble_size=ensemble), spec)
+    learner = make_learner(settings, replace(PLAIN_REWARD, ensemble_size=ensemble, architecture=architecture), spec)
     before = state_of(learner)
     random = np.random.default_rng(5)
     for name in before:  # moved off the start, where biases are zero and advantages small
@@ -273,12 +294,13 @@ def updated(learner, rollouts, **kind):
     return metrics
 
 
+@REWARDS
 @pytest.mark.parametrize('mini_batches', [1, 3])
-def test_the_weights_do_not_depend_on_the_number_of_threads(mini_batches, make_learner):
+def test_the_weights_do_not_depend_on_the_number_of_threads(mini_batches, reward_settings, make_learner):
     settings = replace(LEARNER, num_mini_batches=mini_batches)
     states, metrics = [], []
     for threads in (1, 2, 3):
-        learner = make_learner(replace(settings, learner_threads=threads), replace(REWARD, ensemble_size=2))
+        learner = make_learner(replace(settings, learner_threads=threads), replace(reward_settings, ensemble_size=2))
         metrics.append(updated(learner, range(2), steps=10, worlds=210))  # three shards of the actor's rows
         states.append(state_of(learner))
     for other in (1, 2):
@@ -286,10 +308,11 @@ def test_the_weights_do_not_depend_on_the_number_of_threads(mini_batches, make_l
         assert metrics[0] == metrics[other]
 
 
-def test_the_same_seed_learns_the_same_and_another_seed_something_else(make_learner):
+@REWARDS
+def test_the_same_seed_learns_the_same_and_another_seed_something_else(reward_settings, make_learner):
     states = []
     for seed in (1, 1, 2):
-        learner = make_learner(seed=seed)
+        learner = make_learner(reward_settings=reward_settings, seed=seed)
         updated(learner, range(2))
         states.append(state_of(learner))
     assert_same_bits(states[0], states[1])
@@ -299,7 +322,8 @@ def test_the_same_seed_learns_the_same_and_another_seed_something_else(make_lear
 
 @pytest.mark.parametrize('settings, reward_settings', [
     (LEARNER, REWARD), (replace(LEARNER, beta=0.0), REWARD), (replace(LEARNER, num_mini_batches=2), REWARD),
-    (LEARNER, replace(REWARD, ensemble_size=2))], ids=['beta 0.9', 'beta 0', 'mini-batches', 'ensemble'])
+    (LEARNER, replace(REWARD, ensemble_size=2)), (LEARNER, SHARED_TRUNK)],
+    ids=['beta 0.9', 'beta 0', 'mini-batches', 'ensemble', 'shared trunk'])
 def test_a_learner_goes_on_from_a_checkpoint_bit_for_bit(settings, reward_settings, make_learner):
     one, other = make_learner(settings, reward_settings), make_learner(settings, reward_settings, seed=1)
     updated(one, range(3))
@@ -328,6 +352,8 @@ def test_the_state_of_another_network_is_not_taken_over(make_learner):
         learner.load_state(state_of(make_learner(replace(LEARNER, hidden_size=9))))
     with pytest.raises((KeyError, RuntimeError)):
         learner.load_state(state_of(make_learner(replace(LEARNER, beta=0.0))))
+    with pytest.raises((KeyError, RuntimeError)):
+        learner.load_state(state_of(make_learner(reward_settings=SHARED_TRUNK)))
 
 
 def test_an_update_leaves_the_rollout_and_earlier_policies_as_they_were(make_learner):
@@ -346,7 +372,8 @@ def test_an_update_leaves_the_rollout_and_earlier_policies_as_they_were(make_lea
 
 def test_at_beta_0_there_is_no_reward_network_and_its_settings_change_nothing(make_learner):
     states = []
-    for reward_settings in (REWARD, replace(REWARD, hidden_size=5, ensemble_size=3, learning_rate=0.5, epochs=7)):
+    others = replace(SHARED_TRUNK, hidden_size=5, ensemble_size=3, learning_rate=0.5, epochs=7)
+    for reward_settings in (REWARD, others):
         learner = make_learner(replace(LEARNER, beta=0.0), reward_settings)
         metrics = updated(learner, range(2))
         assert not [name for name in (*learner.state(), *metrics) if 'reward' in name]
@@ -354,15 +381,17 @@ def test_at_beta_0_there_is_no_reward_network_and_its_settings_change_nothing(ma
     assert_same_bits(*states)
 
 
-def test_at_beta_0_no_reward_network_is_built_or_run(make_learner, monkeypatch):
+@REWARDS
+def test_at_beta_0_no_reward_network_is_built_or_run(reward_settings, make_learner, monkeypatch):
     def refuse(*arguments, **more):
         raise AssertionError('a reward network at beta 0')
 
-    monkeypatch.setattr('dae_ros.learning.networks.PerAgentRewardNetwork.__init__', refuse)
-    monkeypatch.setattr('dae_ros.learning.networks.PerAgentRewardNetwork.forward', refuse)
-    updated(make_learner(replace(LEARNER, beta=0.0)), range(1))
+    for name in ('__init__', 'inputs', 'forward', 'gradient'):
+        for architecture in (RewardNetwork, *REWARD_NETWORKS.values()):
+            monkeypatch.setattr(architecture, name, refuse)
+    updated(make_learner(replace(LEARNER, beta=0.0), reward_settings), range(1))
     with pytest.raises(AssertionError, match='a reward network at beta 0'):
-        make_learner(LEARNER)
+        make_learner(LEARNER, reward_settings)
 
 
 # Chunks, filling and mini-batches.
@@ -377,10 +406,13 @@ def close_metrics(one, other, tolerance=1e-4):
         assert one[name] == pytest.approx(other[name], rel=tolerance, abs=1e-5), name
 
 
+@REWARDS
 @pytest.mark.parametrize('length', [1, 3, 5, 21, 50])
-def test_losses_do_not_depend_on_how_the_rollout_is_cut(length, make_learner):
+def test_losses_do_not_depend_on_how_the_rollout_is_cut(length, reward_settings, make_learner):
+    idle = replace(reward_settings, learning_rate=0.0, epochs=1)
+
     def losses(chunk_length):
-        metrics = updated(make_learner(replace(IDLE, chunk_length=chunk_length), IDLE_REWARD), range(1))
+        metrics = updated(make_learner(replace(IDLE, chunk_length=chunk_length), idle), range(1))
         return {name: value for name, value in metrics.items() if not name.endswith('gradient_norm')}
 
     close_metrics(losses(length), losses(7))
@@ -542,9 +574,10 @@ def test_the_ratio_is_1_in_the_first_epoch_also_in_the_middle_of_episodes(mini_b
     assert metrics['policy/entropy'] < 0.98 * math.log(SPEC.num_actions)
 
 
-@pytest.mark.parametrize('beta', [0.0, 0.95, 1.0])
-def test_one_update_makes_a_rewarded_action_more_probable_and_more_updates_certain(beta, make_learner):
-    learner = make_learner(LearnerSettings(hidden_size=8, beta=beta, learning_rate=5e-3, learner_threads=1), REWARD)
+@pytest.mark.parametrize('beta, reward_settings', [(0.0, REWARD), (0.95, REWARD), (1.0, REWARD), (0.95, SHARED_TRUNK)])
+def test_one_update_makes_a_rewarded_action_more_probable_and_more_updates_certain(beta, reward_settings, make_learner):
+    settings = LearnerSettings(hidden_size=8, beta=beta, learning_rate=5e-3, learner_threads=1)
+    learner = make_learner(settings, reward_settings)
 
     def probability_of_1():
         return float(played(learner, how_many_chose_1, rollout=99).probabilities[..., 1].mean())
@@ -558,8 +591,9 @@ def test_one_update_makes_a_rewarded_action_more_probable_and_more_updates_certa
 
 
 @pytest.mark.parametrize('ensemble', [1, 2])
-def test_the_reward_network_learns_a_reward_that_hangs_on_all_actions(ensemble, make_learner):
-    settings = RewardNetworkSettings(hidden_size=16, ensemble_size=ensemble, epochs=15, learning_rate=5e-3)
+@pytest.mark.parametrize('architecture', REWARD_NETWORKS)
+def test_the_reward_network_learns_a_reward_that_hangs_on_all_actions(architecture, ensemble, make_learner):
+    settings = RewardNetworkSettings(architecture, hidden_size=16, ensemble_size=ensemble, epochs=15, learning_rate=5e-3)
     learner = make_learner(replace(LEARNER, learning_rate=0.0), settings)
     explained = [learner.update(played(learner, how_many_chose_1, rollout=rollout), rollout)
                  ['reward_network/explained_variance'] for rollout in range(8)]
