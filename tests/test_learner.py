@@ -499,8 +499,8 @@ def test_an_episode_is_bootstrapped_from_where_it_was_cut_off_and_from_nothing_w
     finals = np.random.default_rng(1).normal(size=(3 if how == 'truncated' else 0, 7)).astype(np.float32)
     trajectory = trajectory._replace(final_states=finals)
     moved_last = trajectory._replace(states=trajectory.states.copy())
-    moved_last.states[-1] += 1
-    moved_final = trajectory._replace(final_states=finals + np.float32(1))
+    moved_last.states[-1, :, 0] += 1  # not all by the same, which the LayerNorm takes away
+    moved_final = trajectory._replace(final_states=finals + np.eye(1, 7, dtype=np.float32))
     states = []
     for one in (trajectory, moved_last, moved_final):
         learner = make_learner()

@@ -72,7 +72,7 @@ def run_in_torch(steps: Iterable[Step], batch: Batch) -> tuple[Tensor, Tensor | 
         if step.kind == 'fan_out':
             table = batch.table
             own = batch.codes is None
-            chosen = table.view(*x.shape[:2], batch.num_agents, -1) if own else functional.embedding(batch.codes, table)
+            chosen = table.view(*x.shape[:2], batch.num_agents, step.outputs) if own else functional.embedding(batch.codes, table)
             x = chosen + x
         x = _ACTIVATIONS[step.activation](x if first is None else functional.linear(x, first, second))
         x = x if third is None else functional.layer_norm(x, third.shape, third, fourth)
