@@ -37,9 +37,21 @@ class TaskSettings:
     num_agents: int = setting(3, 'robots of the team (N)', unit='robots', minimum=1, maximum=1000)
     num_worlds: int = setting(128, 'worlds simulated side by side (W); a real team has 1', unit='worlds',
                               minimum=1, maximum=65536)
+    world_groups: int = setting(1, 'groups of equal size the worlds are split into; each has a world and agents of its own, on '
+                                   'any host', unit='groups', minimum=1, maximum=1024)
     episode_steps: int = setting(0, 'steps after which an episode ends; 0 takes the task\'s own (25 in the particle tasks, '
                                     'N in the matrix game)', unit='steps', minimum=0, maximum=1_000_000)
     observe_others: bool = setting(False, 'formation and line: each robot also observes the other robots\' relative positions')
+
+    def __post_init__(self):
+        if self.num_worlds % self.world_groups:
+            raise SettingsError(f'num_worlds = {self.num_worlds} worlds cannot be split into world_groups = {self.world_groups} '
+                                'groups of equal size')
+
+    @property
+    def worlds_per_group(self) -> int:
+        """How many worlds one group simulates."""
+        return self.num_worlds // self.world_groups
 
 
 @dataclass(frozen=True)
@@ -117,6 +129,13 @@ class RunBinding:
     """Which run a node belongs to. Every node but the trainer, which begins the run, has it."""
 
     run: int = setting(0, 'identity of the run to belong to; 0 joins the first run heard of', minimum=0, maximum=2**63 - 1)
+
+
+@dataclass(frozen=True)
+class GroupBinding:
+    """Which group a node belongs to. Worlds and agents have it."""
+
+    group: int = setting(0, 'group of worlds the node belongs to, from 0', minimum=0, maximum=1023)
 
 
 @dataclass(frozen=True)
@@ -214,6 +233,12 @@ def from_flat(values: Mapping[str, Any], base: Settings = Settings()) -> Setting
         changed.setdefault(info.group, {})[info.attribute] = info.check(value)
     groups = {group: dataclasses.replace(getattr(base, group), **fields) for group, fields in changed.items()}
     return dataclasses.replace(base, **groups)
+
+
+def check_group(group: int, world_groups: int) -> None:
+    """Raises SettingsError if there is no such group."""
+    if group >= world_groups:
+        raise SettingsError(f'group must lie in 0 .. {world_groups - 1} where world_groups is {world_groups}, not {group}')
 
 
 def flatten(settings: Settings) -> dict[str, Any]:

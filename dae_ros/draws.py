@@ -2,7 +2,8 @@
 
 A draw is named by the run's seed, a purpose ('reset', 'action', ...) and the indices it belongs to (rollout, step,
 robot). The name is hashed to the key of a counter-based generator (Philox 4x64; Salmon et al., SC 2011): the same
-name gives the same numbers in any process, in any order, on any attempt.
+name gives the same numbers in any process, in any order, on any attempt. Several groups of worlds draw under seeds of
+their own, which follow from the run's.
 """
 
 from __future__ import annotations
@@ -36,3 +37,8 @@ def key(seed: int, purpose: str, *indices: int) -> int:
 def generator(seed: int, purpose: str, *indices: int) -> np.random.Generator:
     """A generator of its own for the draw named by `seed`, `purpose` and `indices`."""
     return np.random.Generator(np.random.Philox(_Key(_digest(seed, purpose, indices))))
+
+
+def group_seed(seed: int, group: int) -> int:
+    """The seed a group of worlds draws under: the run's for group 0, 128 bits of its own for any other."""
+    return key(seed, 'group', group) if group else seed

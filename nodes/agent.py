@@ -9,7 +9,7 @@ import sys
 
 from dae_ros_msgs import msg, srv
 
-from dae_ros.config import AgentSettings, RunBinding, declarations
+from dae_ros.config import SETTINGS, AgentSettings, GroupBinding, RunBinding, check_group, declarations
 from dae_ros.errors import Refused
 from dae_ros.rollout.lockstep import AgentEnd, check_run
 from dae_ros.ros import convert, names, qos
@@ -21,22 +21,25 @@ LISTENERS = 2  # the world and the trainer: an action must reach both
 
 
 class AgentNode(TeamNode):
-    """Wires an `AgentEnd` to its topics."""
+    """Wires an `AgentEnd` to the topics of its group."""
 
     def __init__(self):
-        super().__init__('agent', declarations(AgentSettings, RunBinding))
+        super().__init__('agent', [*declarations(AgentSettings, GroupBinding, RunBinding), SETTINGS['world_groups']])
         robot, binding = self.settings['robot'], self.settings['run']
-        self._end = AgentEnd(robot, binding)
+        self._group, self._world_groups = self.settings['group'], self.settings['world_groups']
+        check_group(self._group, self._world_groups)
+        self._end = AgentEnd(robot, binding, self._group)
         self._bound = binding != 0
         self._unsent: msg.Action | None = None
         self._fetching: int | None = None
-        self._topic = names.OBSERVATION.format(robot)
-        self._actions = self.publisher(msg.Action, names.ACTION.format(robot), qos.ROLLOUT)
+        observation, action = (names.in_group(topic.format(robot), self._group, self._world_groups)
+                               for topic in (names.OBSERVATION, names.ACTION))
+        self._actions = self.publisher(msg.Action, action, qos.ROLLOUT)
         self._get_policy = self.create_client(srv.GetPolicy, names.GET_POLICY)
         self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED_INPUT, self._on_policy)
         self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
         self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED_INPUT, self._on_request)
-        self.listen(msg.Observation, self._topic, qos.LATCHED_INPUT, self._on_observation)
+        self.listen(msg.Observation, observation, qos.LATCHED_INPUT, self._on_observation)
 
     def on_matched(self) -> None:
         if self._unsent is not None and self._actions.get_subscription_count() >= LISTENERS:
@@ -78,7 +81,7 @@ class AgentNode(TeamNode):
     def _on_status(self, message: msg.TrainingStatus) -> None:
         """An agent that joined the run it heard is free for the next one when that run is over."""
         if message.state == msg.TrainingStatus.FINISHED and message.run == self._end.run and not self._bound:
-            self._end = AgentEnd(self._end.robot)
+            self._end = AgentEnd(self._end.robot, group=self._group)
 
     def _act(self, action: Action | None) -> None:
         if action is None:
@@ -97,7 +100,8 @@ class AgentNode(TeamNode):
             sentence = 'waiting for the world and the trainer to listen'
         else:
             sentence = 'acting'
-        return sentence, {'run': f'{self._end.run:x}', 'robot': self._end.robot, 'policy version': version}
+        group = {'group': self._group} if self._world_groups > 1 else {}
+        return sentence, {'run': f'{self._end.run:x}', **group, 'robot': self._end.robot, 'policy version': version}
 
 
 def main(args: list[str] | None = None) -> int:

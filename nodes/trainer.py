@@ -8,10 +8,12 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from typing import Any, Callable, NamedTuple
 
 from dae_ros_msgs import msg
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
+from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from dae_ros import torchrun
@@ -27,7 +29,7 @@ from dae_ros.config import (
 from dae_ros.errors import DaeRosError
 from dae_ros.final_report import write_report
 from dae_ros.learning.distributed import help_to_learn
-from dae_ros.rollout.assembler import Assembler
+from dae_ros.rollout.groups import GroupedAssembler
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.run_folder import RunFolder
@@ -40,8 +42,16 @@ Status = msg.TrainingStatus
 FAREWELL = Duration(seconds=2)  # to let the last status reach who listens
 
 
+class GroupInputs(NamedTuple):
+    """What the trainer hears of one group of worlds."""
+
+    joint_state: Subscription
+    shared_reward: Subscription
+    actions: list[Subscription]  # of each robot
+
+
 class TrainerNode(TeamNode):
-    """Wires a `Training` and its `Assembler` to their topics. Learning happens in the callback of the last datum."""
+    """Wires a `Training` and its `GroupedAssembler` to their topics. Learning happens in the callback of the last datum."""
 
     def __init__(self):
         super().__init__('trainer', declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings,
@@ -53,17 +63,14 @@ class TrainerNode(TeamNode):
         folder = Path(folder or f'runs/{task.task.replace(":", "_")}_n{spec.num_agents}_seed{settings.run.seed}')
         self._folder = RunFolder(folder, settings)
         self._training = Training(settings, spec, self._folder)
-        self._assembler = Assembler(spec, task.num_worlds)
+        self._assembler = GroupedAssembler(spec, task.worlds_per_group, task.world_groups)
         self._state = Status.WAITING
         self._paused = False
 
         self._policy_update = self.publisher(msg.PolicyWeights, names.POLICY_UPDATE, qos.LATCHED)
         self._request = self.publisher(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED)
         self._status = self.publisher(Status, names.TRAINING_STATUS, qos.LATCHED)
-        self._joint_state = self.listen(msg.JointState, names.JOINT_STATE, qos.ROLLOUT, self._on_joint_state)
-        self._shared_reward = self.listen(msg.SharedReward, names.SHARED_REWARD, qos.ROLLOUT, self._on_reward)
-        self._actions = [self.listen(msg.Action, names.ACTION.format(robot), qos.ROLLOUT, self._on_action)
-                         for robot in range(spec.num_agents)]
+        self._groups = [self._listen_to_group(group) for group in range(task.world_groups)]
         self.create_service(Trigger, names.PAUSE, self._on_pause)
         self.create_service(Trigger, names.RESUME, self._on_resume)
         self.create_service(Trigger, names.SAVE, self._on_save)
@@ -71,6 +78,23 @@ class TrainerNode(TeamNode):
         self.every(settings.run.rollout_timeout / 4, self._begin_anew_if_silent)
         self._publish_policy()
         self._advance()
+
+    def _listen_to_group(self, group: int) -> GroupInputs:
+        """What comes on a group's topics goes to its assembler and to no other."""
+        assembler, world_groups = self._assembler.groups[group], len(self._assembler.groups)
+
+        def listen(kind: type, topic: str, read: Callable[[Any], Any], take: Callable[[Any], None]) -> Subscription:
+            def receive(message) -> None:
+                take(read(message))
+                self._collected()
+
+            return self.listen(kind, names.in_group(topic, group, world_groups), qos.ROLLOUT, receive)
+
+        return GroupInputs(
+            listen(msg.JointState, names.JOINT_STATE, convert.joint_state, assembler.on_joint_state),
+            listen(msg.SharedReward, names.SHARED_REWARD, convert.shared_reward, assembler.on_reward),
+            [listen(msg.Action, names.ACTION.format(robot), convert.action, assembler.on_action)
+             for robot in range(self._training.spec.num_agents)])
 
     # The run, from rollout to rollout.
 
@@ -100,24 +124,16 @@ class TrainerNode(TeamNode):
 
     def _missing(self) -> list[str]:
         """Whom the graph still lacks."""
-        missing = [f'agent of robot {robot}' for robot, action in enumerate(self._actions) if not action.get_publisher_count()]
-        if not self._joint_state.get_publisher_count() or not self._shared_reward.get_publisher_count():
-            missing.append('world')
+        missing = []
+        for group, inputs in enumerate(self._groups):
+            where = f' in group {group}' if len(self._groups) > 1 else ''
+            missing += [f'agent of robot {robot}{where}' for robot, action in enumerate(inputs.actions)
+                        if not action.get_publisher_count()]
+            if not inputs.joint_state.get_publisher_count() or not inputs.shared_reward.get_publisher_count():
+                missing.append(f'world{where}')
         if not self._policy_update.get_subscription_count():
             missing.append('parameter server')
         return missing
-
-    def _on_joint_state(self, message: msg.JointState) -> None:
-        self._assembler.on_joint_state(convert.joint_state(message))
-        self._collected()
-
-    def _on_reward(self, message: msg.SharedReward) -> None:
-        self._assembler.on_reward(convert.shared_reward(message))
-        self._collected()
-
-    def _on_action(self, message: msg.Action) -> None:
-        self._assembler.on_action(convert.action(message))
-        self._collected()
 
     def _collected(self) -> None:
         """Learns once the rollout is complete."""

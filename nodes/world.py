@@ -1,4 +1,4 @@
-"""world: simulates the team's worlds, in lockstep with its agents.
+"""world: simulates the team's worlds, or one group of them, in lockstep with its agents.
 
     ros2 run dae_ros world --ros-args -p task:=navigation -p num_agents:=3 -p num_worlds:=128
 """
@@ -9,7 +9,7 @@ import sys
 
 from dae_ros_msgs import msg
 
-from dae_ros.config import RunBinding, TaskSettings, declarations, from_flat
+from dae_ros.config import GroupBinding, RunBinding, TaskSettings, check_group, declarations, from_flat
 from dae_ros.rollout.lockstep import WorldEnd
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
@@ -21,17 +21,24 @@ class WorldNode(TeamNode):
     """Wires a `WorldEnd` to its topics; begins a rollout once everyone it needs has been found."""
 
     def __init__(self):
-        super().__init__('world', declarations(TaskSettings, RunBinding))
-        binding = self.settings.pop('run')
-        self._worlds = make_worlds(from_flat(self.settings).task)
-        self._end = WorldEnd(self._worlds, binding)
+        super().__init__('world', declarations(TaskSettings, GroupBinding, RunBinding))
+        binding, self._group = self.settings.pop('run'), self.settings.pop('group')
+        task = from_flat(self.settings).task
+        self._world_groups = task.world_groups
+        check_group(self._group, self._world_groups)
+        self._worlds = make_worlds(task)
+        self._end = WorldEnd(self._worlds, binding, self._group)
         self._bound = binding != 0
         self._wanted: RolloutRequest | None = None
+
+        def topic(name: str) -> str:
+            return names.in_group(name, self._group, self._world_groups)
+
         robots = range(self._worlds.spec.num_agents)
-        self._observations = [self.publisher(msg.Observation, names.OBSERVATION.format(i), qos.LATCHED) for i in robots]
-        self._joint_state = self.publisher(msg.JointState, names.JOINT_STATE, qos.ROLLOUT)
-        self._shared_reward = self.publisher(msg.SharedReward, names.SHARED_REWARD, qos.ROLLOUT)
-        self._actions = [self.listen(msg.Action, names.ACTION.format(i), qos.ROLLOUT, self._on_action) for i in robots]
+        self._observations = [self.publisher(msg.Observation, topic(names.OBSERVATION.format(i)), qos.LATCHED) for i in robots]
+        self._joint_state = self.publisher(msg.JointState, topic(names.JOINT_STATE), qos.ROLLOUT)
+        self._shared_reward = self.publisher(msg.SharedReward, topic(names.SHARED_REWARD), qos.ROLLOUT)
+        self._actions = [self.listen(msg.Action, topic(names.ACTION.format(i)), qos.ROLLOUT, self._on_action) for i in robots]
         self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
         self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED_INPUT, self._on_request)
 
@@ -65,7 +72,7 @@ class WorldNode(TeamNode):
     def _on_status(self, message: msg.TrainingStatus) -> None:
         """A world that joined the run it heard is free for the next one when that run is over."""
         if message.state == msg.TrainingStatus.FINISHED and message.run == self._end.run and not self._bound:
-            self._end = WorldEnd(self._worlds)
+            self._end = WorldEnd(self._worlds, group=self._group)
 
     def _send(self, data) -> None:
         for datum in data:
@@ -84,7 +91,7 @@ class WorldNode(TeamNode):
             sentence = f'waiting for actions of robots {self._end.waiting_for}'
         else:
             sentence = 'waiting for a request'
-        values = {'run': f'{self._end.run:x}'}
+        values = {'run': f'{self._end.run:x}'} | ({'group': self._group} if self._world_groups > 1 else {})
         return sentence, values if request is None else {**values, 'rollout': request.rollout, 'attempt': request.attempt}
 
     def close(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from PIL import Image
 from dae_ros.config import TaskSettings
 from dae_ros.learning.policy import Policy, choose
 from dae_ros.report.style import FAINT, GREY, INK, ROBOTS, plain, signed
-from dae_ros.worlds import PREFIX, make_worlds
+from dae_ros.worlds import PREFIX, make_worlds, side_by_side
 from dae_ros.worlds.particle import ParticleWorlds
 
 EPISODES = 3            # side by side
@@ -41,7 +40,7 @@ class Episodes(NamedTuple):
 
 def record_episodes(task: TaskSettings, policy: Policy, seed: int) -> Episodes:
     """A few fresh episodes of the team in which every robot takes its most probable action."""
-    worlds = make_worlds(dataclasses.replace(task, num_worlds=EPISODES))
+    worlds = make_worlds(side_by_side(task, EPISODES))
     try:
         return _record(task.task, worlds, policy, seed)
     finally:

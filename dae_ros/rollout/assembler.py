@@ -1,4 +1,4 @@
-"""Joins stamped joint states, actions and rewards into the trajectory of one rollout, in whatever order they arrive."""
+"""Joins one group's stamped joint states, actions and rewards into a trajectory, in whatever order they arrive."""
 
 from __future__ import annotations
 

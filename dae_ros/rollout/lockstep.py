@@ -11,6 +11,7 @@ from typing import Union
 
 import numpy as np
 
+from dae_ros import draws
 from dae_ros.errors import Refused
 from dae_ros.learning.policy import Policy, choose
 from dae_ros.types import Action, JointState, Observation, RolloutRequest, SharedReward, Stamp
@@ -59,13 +60,14 @@ def check_action(action: Action, num_agents: int, num_worlds: int, num_actions: 
 
 
 class WorldEnd:
-    """Steps a batch of worlds through the rollouts it is asked for.
+    """Steps one group's batch of worlds through the rollouts it is asked for.
 
     `run` binds it to one run from the start; 0 lets it join the run of the first request it hears.
     """
 
-    def __init__(self, worlds: Worlds, run: int = 0):
+    def __init__(self, worlds: Worlds, run: int = 0, group: int = 0):
         self._worlds = worlds
+        self._group = group
         self.run = run
         self.request: RolloutRequest | None = None
         self._step = 0
@@ -91,7 +93,7 @@ class WorldEnd:
         self.check_request(request)
         self.run, self.request, self._step = request.run, request, 0
         self._actions = {}
-        return self._show(self._worlds.reset(request.seed, request.rollout))
+        return self._show(self._worlds.reset(draws.group_seed(request.seed, self._group), request.rollout))
 
     def on_action(self, action: Action) -> list[WorldDatum]:
         """Takes in one robot's action; with the last one missing, steps the worlds and gives what that did."""
@@ -132,10 +134,11 @@ class WorldEnd:
 
 
 class AgentEnd:
-    """Acts for one robot: only on the rollout asked for, only with the version it names, each step once."""
+    """Acts for one robot of one group: only on the rollout asked for, only with the version it names, each step once."""
 
-    def __init__(self, robot: int, run: int = 0):
+    def __init__(self, robot: int, run: int = 0, group: int = 0):
         self.robot = robot
+        self._group = group
         self.run = run
         self.request: RolloutRequest | None = None
         self._policies: dict[int, Policy] = {}
@@ -216,6 +219,7 @@ class AgentEnd:
                                                f'{policy.architecture.observation_size}')
         state = policy.initial_state(len(pending.values)) if self._state is None else self._state
         probabilities, self._state = policy.act(pending.values, state, pending.episode_start)
-        actions = choose(probabilities, request.greedy, request.seed, request.rollout, pending.stamp.step, self.robot)
+        seed = draws.group_seed(request.seed, self._group)
+        actions = choose(probabilities, request.greedy, seed, request.rollout, pending.stamp.step, self.robot)
         self._next_step += 1
         return Action(pending.stamp, self.robot, pending.policy_version, actions, probabilities)

@@ -31,16 +31,22 @@ class NodeProcess(NamedTuple):
 
 
 def training_graph(settings: Settings, folder: RunFolder) -> list[NodeProcess]:
-    """World, one agent per robot, parameter server and trainer of one run."""
+    """Parameter server, trainer and, for each group, a world and one agent per robot: the processes of one run."""
     run = {'run': folder.run}
-    agents = [NodeProcess('agent', f'agent_{robot}', {'robot': robot, **run}) for robot in range(settings.task.num_agents)]
     return [
-        NodeProcess('world', 'world', run),
-        *agents,
+        *(process for group in range(settings.task.world_groups) for process in _group(settings, group, run)),
         NodeProcess('parameter_server', 'parameter_server',
                     {'policies_folder': str(folder.policies), 'keep_policies': settings.run.keep_checkpoints, **run}),
         NodeProcess('trainer', 'trainer', {'run_folder': str(folder.path)}),
     ]
+
+
+def _group(settings: Settings, group: int, run: dict[str, int]) -> list[NodeProcess]:
+    """World and agents of one group, numbered where there are several."""
+    mark = f'_{group}' if settings.task.world_groups > 1 else ''
+    agents = [NodeProcess('agent', f'agent{mark}_{robot}', {'group': group, 'robot': robot, **run})
+              for robot in range(settings.task.num_agents)]
+    return [NodeProcess('world', f'world{mark}', {'group': group, **run}), *agents]
 
 
 def find_task_file(name: str) -> Path:

@@ -1,4 +1,7 @@
-"""Names of topics and services, all relative: a team lives in the namespace its nodes are started in."""
+"""Names of topics and services, all relative: a team lives in the namespace its nodes are started in.
+
+The topics of observations, actions, joint states and rewards are each group's own; give them through `in_group`.
+"""
 
 OBSERVATION = 'robot_{}/observation'
 ACTION = 'robot_{}/action'
@@ -13,3 +16,8 @@ PAUSE = 'trainer/pause'
 RESUME = 'trainer/resume'
 SAVE = 'trainer/save'
 DIAGNOSTICS = '/diagnostics'
+
+
+def in_group(topic: str, group: int, world_groups: int) -> str:
+    """The topic of one group of worlds; a group that is the only one needs no name."""
+    return topic if world_groups == 1 else f'group_{group}/{topic}'

@@ -13,7 +13,7 @@ from dae_ros.worlds.matrix_game import MatrixGame
 from dae_ros.worlds.pettingzoo import PREFIX, PettingZooWorlds
 from dae_ros.worlds.tasks import Formation, Line, Navigation
 
-__all__ = ['BUILT_IN', 'JointObservation', 'Transition', 'Worlds', 'make_worlds', 'world_spec']
+__all__ = ['BUILT_IN', 'JointObservation', 'Transition', 'Worlds', 'make_worlds', 'side_by_side', 'world_spec']
 
 BUILT_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
     'navigation': Navigation,
@@ -24,11 +24,12 @@ BUILT_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
 
 
 def make_worlds(task: TaskSettings) -> Worlds:
-    """The worlds `task` asks for, not yet reset.
+    """The worlds of one group of those `task` asks for, not yet reset; all groups' are alike and differ in their draws.
 
     Raises SettingsError for an unknown task or settings that do not fit it, WorldError where a PettingZoo environment
     cannot be used.
     """
+    task = side_by_side(task, task.worlds_per_group)
     if task.task in BUILT_IN:
         return BUILT_IN[task.task](task)
     if task.task.startswith(PREFIX):
@@ -41,6 +42,11 @@ def world_spec(task: TaskSettings) -> WorldSpec:
 
     Raises as `make_worlds`.
     """
-    worlds = make_worlds(dataclasses.replace(task, num_worlds=1))
+    worlds = make_worlds(side_by_side(task, 1))
     worlds.close()
     return worlds.spec
+
+
+def side_by_side(task: TaskSettings, num_worlds: int) -> TaskSettings:
+    """`task` with so many worlds, in one group."""
+    return dataclasses.replace(task, num_worlds=num_worlds, world_groups=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from itertools import count
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from dae_ros import draws
 from dae_ros.config import TaskSettings
-from dae_ros.worlds import PREFIX, make_worlds, world_spec
+from dae_ros.worlds import PREFIX, make_worlds, side_by_side, world_spec
 from dae_ros.worlds.base import Worlds
 from dae_ros.worlds.matching import match
 from dae_ros.worlds.matrix_game import MatrixGame
@@ -31,9 +30,9 @@ def yardstick_returns(task: TaskSettings, num_episodes: int, seed: int) -> dict[
     """
     if num_episodes < 1:
         raise ValueError(f'num_episodes must be at least 1, not {num_episodes}')
-    side_by_side = (task.num_worlds if task.task.startswith(PREFIX)
-                    else max(1, FEATURES_AT_ONCE // world_spec(task).state_size))
-    worlds = make_worlds(dataclasses.replace(task, num_worlds=min(num_episodes, side_by_side)))
+    at_once = (task.num_worlds if task.task.startswith(PREFIX)
+               else max(1, FEATURES_AT_ONCE // world_spec(task).state_size))
+    worlds = make_worlds(side_by_side(task, min(num_episodes, at_once)))
     controllers: dict[str, Controller] = {'no-op': _no_op, 'random': _random}
     if isinstance(worlds, ParticleWorlds):
         controllers['greedy'] = lambda worlds, draw: greedy_actions(worlds)
