@@ -9,7 +9,6 @@ threads run side by side.
 from __future__ import annotations
 
 import ctypes
-import math
 import os
 import warnings
 from typing import NamedTuple, Sequence
@@ -207,11 +206,15 @@ def _array(tensor: Tensor | None, shape: Sequence[int], dtype: torch.dtype, kept
         return _Array(None, 0, 0)
     if tensor.dtype != dtype or tensor.shape != torch.Size(shape):
         raise ValueError(f'{tensor.dtype} {tuple(tensor.shape)} where {dtype} {tuple(shape)} is needed')
-    inner = math.prod(tensor.shape[2:])
-    if not tensor.numel() or not tensor[0, 0].is_contiguous() or any(stride % inner for stride in tensor.stride()[:2]):
+    inner, together = 1, True
+    for size, stride in zip(shape[:1:-1], tensor.stride()[:1:-1]):
+        together &= size == 1 or stride == inner
+        inner *= size or 1
+    if not together or any(stride % inner for stride in tensor.stride()[:2]):
         tensor = tensor.contiguous()
     kept.append(tensor)
-    return _Array(tensor.data_ptr(), *(stride // max(inner, 1) for stride in tensor.stride()[:2]))
+    step, column = tensor.stride()[:2]
+    return _Array(tensor.data_ptr(), step // inner, column // inner)
 
 
 def _address(tensor: Tensor | None) -> int | None:

@@ -121,10 +121,10 @@ INLINE vec reduce(vec y, ivec *power) {
     return y - k * all(0.693359375f) + k * all(2.12194440e-4f);
 }
 
-/* To 1e-7 relative, by the Chebyshev polynomial of degree 5; x is held within -87 .. 87. */
-INLINE vec exp_of(vec x) {
+/* To 1e-7 relative, by the Chebyshev polynomial of degree 5; x is held within -limit .. limit, at most 87. */
+INLINE vec exp_of(vec x, float limit) {
     ivec power;
-    vec f = reduce(clamp(x, 87), &power);
+    vec f = reduce(clamp(x, limit), &power);
     vec e = f * all(0.008296807f) + all(0.04194099f);
     e = e * f + all(0.16667749f);
     e = e * f + all(0.4999862f);
@@ -133,7 +133,12 @@ INLINE vec exp_of(vec x) {
     return (vec)((ivec)e + power);
 }
 
-INLINE vec sigmoid_of(vec x) { return all(1) / (all(1) + exp_of(-x)); }
+/* x and y to their sigmoids, with one division; exact to 1e-18 where it is smaller. */
+INLINE void two_sigmoids(vec *x, vec *y) {
+    vec a = all(1) + exp_of(-*x, 43), b = all(1) + exp_of(-*y, 43), inverse = all(1) / (a * b);
+    *x = inverse * b;
+    *y = inverse * a;
+}
 
 /* To 1e-7 relative, near zero too: (e^2x - 1) / (e^2x + 1), with e^2x - 1 = 2^k (e^f - 1) + (2^k - 1). */
 INLINE vec tanh_of(vec x) {
@@ -447,6 +452,9 @@ static void state_before(long rows, long H, const float *states, const uint8_t *
             memcpy(before + row * H, states + row * H, (size_t)H * sizeof(float));
 }
 
+/* What the backward pass needs of a row of a panel: candidate, reset, update, candidate from the state. */
+enum { GATES = 4 * COLUMNS };
+
 /* Gates, candidate and new state of a panel of at most COLUMNS units; products as in GruForward. In two passes, so that
  * the processor has many short chains of operations to overlap. */
 static void gates_panel(long rows, long columns, long H, float *products, const float *before, const float *bias_ih,
@@ -460,8 +468,10 @@ static void gates_panel(long rows, long columns, long H, float *products, const 
         const vec input_bias = load_upto(bias_ih + 2 * H + j, lanes);
         const vec state_bias = load_upto(bias_hh + 2 * H + j, lanes);
         for (long at = j; at < rows * COLUMNS; at += COLUMNS) {
-            store(products + at, sigmoid_of(load(products + at) + reset_bias));
-            store(update_products + at, sigmoid_of(load(update_products + at) + update_bias));
+            vec reset = load(products + at) + reset_bias, update = load(update_products + at) + update_bias;
+            two_sigmoids(&reset, &update);
+            store(products + at, reset);
+            store(update_products + at, update);
         }
         for (long row = 0; row < rows; row++) {
             const long at = row * COLUMNS + j;
@@ -471,11 +481,11 @@ static void gates_panel(long rows, long columns, long H, float *products, const 
             vec old = load_upto(before + row * H + j, lanes);
             store_upto(states + row * H + j, candidate + update * (old - candidate), lanes);
             if (gates) {
-                float *saved = gates + row * 4 * H + j;
-                store_upto(saved, candidate, lanes);
-                store_upto(saved + H, reset, lanes);
-                store_upto(saved + 2 * H, update, lanes);
-                store_upto(saved + 3 * H, from_state, lanes);
+                float *saved = gates + row * GATES + j;
+                store(saved, candidate);
+                store(saved + COLUMNS, reset);
+                store(saved + 2 * COLUMNS, update);
+                store(saved + 3 * COLUMNS, from_state);
             }
         }
     });
@@ -491,7 +501,7 @@ static void pack_gru(const Step *step, float *packed) {
         }
 }
 
-/* States [L, R, H] after each step; gates, unless NULL: [L, R, 4 H] candidate, reset, update, candidate from the state.
+/* States [L, R, H] after each step, and for the backward pass the gates, panel by panel.
  * inputs [L, R, I], initial [R, H], start [L, R]. */
 static void gru_forward(long L, long R, const Step *step, const Work *work, const float *inputs, const float *initial,
                         const Scratch *s) {
@@ -513,7 +523,8 @@ static void gru_forward(long L, long R, const Step *step, const Work *work, cons
                     times_panel(rows, H, s->before, H, weights + I * COLUMNS, from_state, COLUMNS, gate < 2);
                 }
                 gates_panel(rows, min(COLUMNS, H - column), H, s->products, s->before + column, bias_ih + column,
-                            bias_hh + column, states + at * H + column, gates ? gates + at * 4 * H + column : NULL);
+                            bias_hh + column, states + at * H + column,
+                            gates ? gates + 4 * at * round_up(H, COLUMNS) + rows * 4 * column : NULL);
             }
         }
     }
@@ -530,6 +541,42 @@ static void pack_gru_backward(const Step *step, Work *work, int to_inputs) {
     pack(3 * H, H, step->parameters[1], H, work->backward_state, 3 * H);
 }
 
+/* Gradients before the gates [rows, 4 H], candidate, reset, update, candidate from the state, added to `bias` [4 H]; what
+ * passes by the gates to the state before is left in `carried`. */
+static void gates_panels_backward(long rows, long H, const float *gates, const float *before, const float *incoming,
+                                  float *carried, float *gradients, float *bias) {
+    for (long column = 0; column < H; column += COLUMNS, gates += rows * GATES)
+        FOR_EACH_VECTOR(min(COLUMNS, H - column), {
+            vec candidates = all(0), resets = all(0), updates = all(0), from_states = all(0);
+            const long first = column + j;
+            for (long row = 0; row < rows; row++) {
+                const float *saved = gates + row * GATES + j;
+                const long at = row * H + first;
+                vec candidate = load(saved), reset = load(saved + COLUMNS), update = load(saved + 2 * COLUMNS);
+                vec grad = load_upto(carried + at, lanes) + load_upto(incoming + at, lanes);
+                vec kept = grad * update;
+                vec to_candidate = (grad - kept) * (all(1) - candidate * candidate);
+                vec to_state = to_candidate * reset;
+                vec to_reset = to_state * load(saved + 3 * COLUMNS) * (all(1) - reset);
+                vec to_update = kept * (load_upto(before + at, lanes) - candidate) * (all(1) - update);
+                float *out = gradients + row * 4 * H + first;
+                store_upto(carried + at, kept, lanes);
+                store_upto(out, to_candidate, lanes);
+                store_upto(out + H, to_reset, lanes);
+                store_upto(out + 2 * H, to_update, lanes);
+                store_upto(out + 3 * H, to_state, lanes);
+                candidates += to_candidate;
+                resets += to_reset;
+                updates += to_update;
+                from_states += to_state;
+            }
+            add_to(bias + first, candidates, lanes);
+            add_to(bias + H + first, resets, lanes);
+            add_to(bias + 2 * H + first, updates, lanes);
+            add_to(bias + 3 * H + first, from_states, lanes);
+        });
+}
+
 /* Gradients of what gru_forward computed, from those of its states [L, R, H]; grad_inputs may be NULL. */
 static void gru_backward(long L, long R, const Step *step, const Work *work, const float *inputs, const float *initial,
                          const float *grad_states, float *grad_inputs, const Scratch *s) {
@@ -542,30 +589,8 @@ static void gru_backward(long L, long R, const Step *step, const Work *work, con
         for (long t = L - 1; t >= 0; t--) {
             const long at = t * R + first;
             state_before(rows, H, t ? work->y + (at - R) * H : initial + first * H, s->start + at, s->before);
-            for (long row = 0; row < rows; row++) {
-                const float *saved = work->gates + (at + row) * 4 * H, *incoming = grad_states + (at + row) * H;
-                float *out = s->gate_gradients + row * 4 * H, *carried = s->carried + row * H;
-                const float *before = s->before + row * H;
-                FOR_EACH_VECTOR(H, {
-                    vec candidate = load_upto(saved + j, lanes), reset = load_upto(saved + H + j, lanes);
-                    vec update = load_upto(saved + 2 * H + j, lanes), from_state = load_upto(saved + 3 * H + j, lanes);
-                    vec grad = load_upto(carried + j, lanes) + load_upto(incoming + j, lanes);
-                    vec kept = grad * update;
-                    vec to_candidate = (grad - kept) * (all(1) - candidate * candidate);
-                    vec to_state = to_candidate * reset;
-                    vec to_reset = to_state * from_state * (all(1) - reset);
-                    vec to_update = kept * (load_upto(before + j, lanes) - candidate) * (all(1) - update);
-                    store_upto(carried + j, kept, lanes);
-                    store_upto(out + j, to_candidate, lanes);
-                    store_upto(out + H + j, to_reset, lanes);
-                    store_upto(out + 2 * H + j, to_update, lanes);
-                    store_upto(out + 3 * H + j, to_state, lanes);
-                    add_to(s->bias + j, to_candidate, lanes);
-                    add_to(s->bias + H + j, to_reset, lanes);
-                    add_to(s->bias + 2 * H + j, to_update, lanes);
-                    add_to(s->bias + 3 * H + j, to_state, lanes);
-                });
-            }
+            gates_panels_backward(rows, H, work->gates + 4 * at * round_up(H, COLUMNS), s->before, grad_states + at * H,
+                                  s->carried, s->gate_gradients, s->bias);
             if (grad_inputs)
                 times_packed(rows, I, 3 * H, s->gate_gradients, 4 * H, work->backward, grad_inputs + at * I, I, 0);
             if (t)
@@ -825,7 +850,7 @@ static void policy_loss(long T, long N, long A, const Loss *loss, const float *l
         vec total = all(0), expected = all(0);
         FOR_EACH_VECTOR(A, {
             vec apart = load_upto(logits + j, lanes) - all(largest);
-            store_upto(grad + j, exp_of(apart), lanes);
+            store_upto(grad + j, exp_of(apart, 87), lanes);
             vec e = load_upto(grad + j, lanes); /* nothing beyond the last action */
             total += e;
             expected += e * apart;
@@ -917,7 +942,7 @@ static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *ba
         work->statistics = take(arena, 2 * work->count);
         if (step->kind == GRU) {
             work->forward = take(arena, 3 * packed_size(I + O, O));
-            work->gates = loss ? take(arena, work->count * 4 * O) : NULL;
+            work->gates = loss ? take(arena, work->count * 4 * round_up(O, COLUMNS)) : NULL;
             work->backward = loss ? take(arena, packed_size(3 * O, I)) : NULL;
             work->backward_state = loss ? take(arena, packed_size(3 * O, O)) : NULL;
             units = max(units, O);
