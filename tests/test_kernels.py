@@ -537,6 +537,8 @@ kernels.library = kernels.opened(sys.argv[1])
 tests = runpy.run_path(sys.argv[2])
 for network, batch, loss in tests['odd_shapes']():
     tests['results'](network, batch, loss)
+    for laid_out in tests['LAYOUTS'].values():
+        tests['results'](network, tests['changed'](batch, laid_out), tests['changed'](loss, laid_out))
 """
 
 
