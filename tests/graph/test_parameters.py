@@ -45,6 +45,9 @@ def test_an_unknown_key_in_a_parameter_file_is_an_error_too(domain, tmp_path):
     ('world', 'beta:=true', 'beta must be a number, not True'),
     ('agent', 'robot:=first', "robot must be an integer, not 'first'"),
     ('world', 'task:=soccer', "unknown task 'soccer'"),
+    ('world', 'group:=1', 'group must lie in 0 .. 0 where world_groups is 1, not 1'),
+    ('agent', 'group:=2', 'group must lie in 0 .. 0 where world_groups is 1, not 2'),
+    ('trainer', 'world_groups:=3', 'num_worlds = 128 worlds cannot be split into world_groups = 3 groups of equal size'),
 ])
 def test_a_wrong_value_is_one_sentence(node, override, sentence, domain):
     assert sentence in failure(node, '-p', override)

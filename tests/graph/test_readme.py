@@ -27,7 +27,8 @@ def blocks(language: str) -> list[list[str]]:
 
 COMMANDS = [line for block in blocks('bash') for line in block]
 BRINGUPS = [line for line in COMMANDS if 'bringup' in line and not line.startswith('ros2 ')]
-NODES = next(block for block in blocks('bash') if any('trainer' in line for line in block))
+ONE_BY_ONE = [[line for line in block if '--ros-args' in line or line.endswith('/parameter_server')] for block in blocks('bash')]
+ONE_TEAM, GROUP_0, GROUP_1 = (block for block in ONE_BY_ONE if block)
 
 
 @pytest.fixture
@@ -46,7 +47,7 @@ def run(command: str, folder) -> None:
 
 
 def test_no_command_of_the_readme_is_forgotten():
-    others = set(COMMANDS) - set(BRINGUPS) - set(NODES) - BY_CONTINUOUS_INTEGRATION - WITH_ROS_INSTALLED
+    others = set(COMMANDS) - set(BRINGUPS) - {*ONE_TEAM, *GROUP_0, *GROUP_1} - BY_CONTINUOUS_INTEGRATION - WITH_ROS_INSTALLED
     assert all(line.startswith('ros2 ') for line in others), others
 
 
@@ -57,8 +58,9 @@ def test_a_bringup_command_of_the_readme_trains_and_leaves_its_run(command, fold
     assert summary.stat().st_size > 0
 
 
-def test_the_nodes_start_one_by_one_as_the_readme_says(folder):
-    commands = [f'{line} {SHORTER}' if '--params-file' in line else line for line in NODES]
+@pytest.mark.parametrize('nodes', [ONE_TEAM, GROUP_1 + GROUP_0], ids=['one group', 'two groups'])
+def test_the_nodes_start_one_by_one_as_the_readme_says(nodes, folder):
+    commands = [f'{line} {SHORTER}' if '--params-file' in line else line for line in nodes]
     *others, trainer = commands
     processes = [subprocess.Popen(shlex.split(command), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
                  for command in others]

@@ -5,14 +5,15 @@ from __future__ import annotations
 import random
 
 import pytest
-from harness import SMALL, bringup, finish, oracle, processes_naming
+from harness import SMALL, Listener, bringup, finish, oracle, processes_naming
 
 from dae_ros.report.summary import Summary
 
+GROUPS = {**SMALL, 'num_agents': 2, 'world_groups': 2}
 MATRIX_GAME = {**SMALL, 'task': 'matrix_game', 'num_agents': 4, 'num_steps': 4, 'total_steps': 5 * 8 * 4, 'beta': 1.0}
 
 
-@pytest.mark.parametrize('values', [SMALL, MATRIX_GAME], ids=['navigation', 'matrix_game'])
+@pytest.mark.parametrize('values', [SMALL, MATRIX_GAME, GROUPS], ids=['navigation', 'matrix_game', 'two groups'])
 def test_a_graph_run_ends_with_the_weights_of_the_in_process_run_bit_for_bit(values, domain, tmp_path):
     code, output, errors = finish(bringup(tmp_path / 'graph', values))
     assert code == 0, errors
@@ -49,6 +50,20 @@ def test_nodes_find_each_other_whatever_the_order_they_are_started_in(shuffle, m
     graph.start(*names)
     assert graph.wait() == 0, graph.log('trainer')
     assert graph.result() == oracle(tmp_path / 'alone', SMALL)
+
+
+def test_a_group_that_starts_late_is_waited_for_by_its_name_and_changes_no_weight(make_graph, tmp_path):
+    graph = make_graph(tmp_path / 'graph', GROUPS)
+    late = ['agent_1_0', 'agent_1_1', 'world_1']
+    graph.start(*(name for name in graph.names if name not in late))
+    missing = [f'{name} in group 1' for name in ('agent of robot 0', 'agent of robot 1', 'world')]
+    with Listener() as listener:
+        for started, node in enumerate(late):
+            listener.wait_for_status(lambda status: status.detail == f'waiting for {", ".join(missing[started:])}')
+            graph.start(node)
+    assert graph.wait() == 0, graph.log('trainer')
+    assert graph.result() == oracle(tmp_path / 'alone', GROUPS)
+    assert 'refused' not in ''.join(graph.log(node) for node in graph.names)
 
 
 def test_two_teams_in_two_namespaces_do_not_disturb_each_other(make_graph, tmp_path):
