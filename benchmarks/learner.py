@@ -44,12 +44,12 @@ def recurrent_flops(hidden: int, inputs: int, outputs: int, layers: int) -> floa
     return 2 * (first + 3 * ((layers - 1) * hidden**2 + 6 * hidden**2 + hidden * outputs))
 
 
-def reward_flops(architecture: str, spec: WorldSpec, hidden: int) -> float:
+def reward_flops(architecture: str, spec: WorldSpec, hidden: int, trunk: int) -> float:
     N, A = spec.num_agents, spec.num_actions
-    gru, square, head = 6 * hidden**2, hidden**2, hidden * A
+    square, head = hidden**2, hidden * A
     if architecture == 'per_agent':
-        return 2 * (2 * spec.state_size * hidden + 3 * square + 3 * N * (gru + head))
-    return 2 * (2 * (spec.state_size + N * A) * hidden + 3 * (gru + square) + 3 * N * (square + head))
+        return 2 * (2 * spec.state_size * hidden + 3 * square + 3 * N * (6 * square + head))
+    return 2 * (2 * (spec.state_size + N * A) * trunk + 3 * (6 * trunk**2 + trunk * hidden) + 3 * N * (square + head))
 
 
 def random_trajectory(spec: WorldSpec, worlds: int) -> Trajectory:
@@ -92,11 +92,11 @@ def epoch(network: networks.Network, rows: int, inputs: int, spec: WorldSpec, ch
 
 def rows(spec: WorldSpec, settings: Settings, worlds: int) -> list[Row]:
     learner, N = settings.learner, spec.num_agents
-    H, R = learner.hidden_size, settings.reward_network.hidden_size
+    H, reward = learner.hidden_size, settings.reward_network
     steps, chunks = worlds * STEPS, -(-worlds * STEPS // learner.chunk_length)
     flops = {'actor': N * recurrent_flops(H, spec.observation_size, spec.num_actions, learner.mlp_layers),
              'critic': recurrent_flops(H, spec.state_size, 1, learner.mlp_layers)}
-    flops |= {name: reward_flops(name, spec, R) for name in ARCHITECTURES}
+    flops |= {name: reward_flops(name, spec, reward.hidden_size, reward.trunk_size) for name in ARCHITECTURES}
     made = {'actor': (networks.make_actor(spec, learner, 1), N, spec.observation_size),
             'critic': (networks.make_critic(spec, learner, 1), 1, spec.state_size)}
     for name in ARCHITECTURES:

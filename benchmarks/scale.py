@@ -69,7 +69,9 @@ def measured(changes: dict[str, Any]) -> dict[str, float]:
 
 def grown(size: str, value: int, architecture: str) -> dict[str, Any]:
     changes = {size: value, 'reward_network.architecture': architecture}
-    return changes | {'reward_network.hidden_size': 2 * value} if size == 'hidden_size' else changes
+    if size == 'hidden_size':
+        changes |= {'reward_network.hidden_size': 2 * value, 'reward_network.trunk_size': 3 * value // 2}
+    return changes
 
 
 def measure() -> dict[str, dict[str, list[float]]]:

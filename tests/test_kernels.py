@@ -14,6 +14,7 @@ from unittest import mock
 import pytest
 import torch
 
+from dae_ros.config import RewardNetworkSettings
 from dae_ros.learning import kernels, losses, networks
 from dae_ros.learning.native import build
 from dae_ros.types import WorldSpec
@@ -259,7 +260,8 @@ def test_actor_and_critic_and_their_gradients_equal_torch_in_double_precision(ac
 
 
 def reward_network(architecture, N, A, C, L=5, hidden=20, seed=0):
-    network = with_random_parameters(networks.REWARD_NETWORKS[architecture](WorldSpec(N, A, 4, 11, False), hidden), seed)
+    settings = RewardNetworkSettings(architecture, hidden_size=hidden, trunk_size=hidden - 3)
+    network = with_random_parameters(networks.REWARD_NETWORKS[architecture](WorldSpec(N, A, 4, 11, False), settings), seed)
     batch = batch_for(network, L, C, 1, 11, network.states_per_world(), one_of(range(A), L, C, N, seed=seed), seed)
     return network, batch._replace(inputs=network.inputs(batch.inputs, batch.actions, batch.episode_start))
 

@@ -17,7 +17,7 @@ from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint, encode_p
 
 SPEC = WorldSpec(num_agents=3, num_actions=4, observation_size=5, state_size=7, state_is_observations=False)
 LEARNER = LearnerSettings(hidden_size=8, epochs=2, beta=0.9, learner_threads=1)
-REWARD = RewardNetworkSettings(hidden_size=12, epochs=2)
+REWARD = RewardNetworkSettings(hidden_size=12, trunk_size=10, epochs=2)
 SHARED_TRUNK = replace(REWARD, architecture='shared_trunk')
 REWARDS = pytest.mark.parametrize('reward_settings', [REWARD, SHARED_TRUNK], ids=['per agent', 'shared trunk'])
 

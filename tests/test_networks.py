@@ -14,7 +14,7 @@ from dae_ros.types import WorldSpec
 
 SPEC = WorldSpec(num_agents=3, num_actions=4, observation_size=5, state_size=9, state_is_observations=False)
 LEARNER = LearnerSettings(hidden_size=16)
-REWARD = RewardNetworkSettings(hidden_size=24)
+REWARD = RewardNetworkSettings(hidden_size=24, trunk_size=20)
 
 
 def normal(*shape, seed=0, dtype=torch.float32):
@@ -144,7 +144,7 @@ def test_an_episode_begins_without_memory_of_the_one_before(name):
 def predictions(network, states, actions, episode_start):
     """[T, W, N, A] for states [T, W, S], actions [T, W, N] and episode starts [T, W]."""
     with torch.no_grad():
-        initial = torch.zeros(actions.shape[1], network.states_per_world(), REWARD.hidden_size)
+        initial = torch.zeros(actions.shape[1], network.states_per_world(), network.hidden_size)
         inputs = network.inputs(states.unsqueeze(2), actions, episode_start)
         return network(inputs, initial, episode_start, actions)[0]
 

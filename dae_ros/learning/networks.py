@@ -175,9 +175,9 @@ class RewardNetwork(Network):
     five actions).
     """
 
-    def __init__(self, spec: WorldSpec, hidden_size: int):
+    def __init__(self, spec: WorldSpec, settings: RewardNetworkSettings):
         super().__init__()
-        self.hidden_size = hidden_size
+        hidden_size = settings.hidden_size
         self.num_agents, self.num_actions = spec.num_agents, spec.num_actions
         self.action_embedding = nn.Parameter(torch.empty(spec.num_agents * spec.num_actions, hidden_size))
         self.action_bias = nn.Parameter(torch.empty(hidden_size))
@@ -211,8 +211,9 @@ class RewardNetwork(Network):
 class PerAgentRewardNetwork(RewardNetwork):
     """The paper's: recurrent over the state and a_-i, one sequence per agent."""
 
-    def __init__(self, spec: WorldSpec, hidden_size: int):
-        super().__init__(spec, hidden_size)
+    def __init__(self, spec: WorldSpec, settings: RewardNetworkSettings):
+        super().__init__(spec, settings)
+        hidden_size = self.hidden_size = settings.hidden_size
         self.state = nn.Linear(spec.state_size, hidden_size)
         self.state_norm = nn.LayerNorm(hidden_size)
         self.joint_state = nn.Linear(hidden_size, hidden_size, bias=False)
@@ -238,13 +239,15 @@ class SharedTrunkRewardNetwork(RewardNetwork):
     It sees more than the paper's, which never shows an agent its own earlier actions, and costs about a third at N = 3.
     """
 
-    def __init__(self, spec: WorldSpec, hidden_size: int):
-        super().__init__(spec, hidden_size)
-        self.trunk = nn.Linear(spec.state_size + spec.num_agents * spec.num_actions, hidden_size)
-        self.trunk_norm = nn.LayerNorm(hidden_size)
-        self.gru = Gru(hidden_size, hidden_size)
-        self.gru_norm = nn.LayerNorm(hidden_size)
-        self.joint_state = nn.Linear(hidden_size, hidden_size, bias=False)
+    def __init__(self, spec: WorldSpec, settings: RewardNetworkSettings):
+        super().__init__(spec, settings)
+        hidden_size, trunk_size = settings.hidden_size, settings.trunk_size
+        self.hidden_size = trunk_size
+        self.trunk = nn.Linear(spec.state_size + spec.num_agents * spec.num_actions, trunk_size)
+        self.trunk_norm = nn.LayerNorm(trunk_size)
+        self.gru = Gru(trunk_size, trunk_size)
+        self.gru_norm = nn.LayerNorm(trunk_size)
+        self.joint_state = nn.Linear(trunk_size, hidden_size, bias=False)
         self.joint_norm = nn.LayerNorm(hidden_size)
         self.hidden = nn.Linear(hidden_size, hidden_size)
         self.hidden_norm = nn.LayerNorm(hidden_size)
@@ -282,7 +285,7 @@ def make_critic(spec: WorldSpec, settings: LearnerSettings, seed: int) -> Recurr
 
 def make_reward_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int, member: int) -> RewardNetwork:
     """Member `member` of the reward ensemble (algorithm 1, line 14)."""
-    network = REWARD_NETWORKS[settings.architecture](spec, settings.hidden_size)
+    network = REWARD_NETWORKS[settings.architecture](spec, settings)
     return _initialise(network, _GAINS['relu'], 1.0, seed, f'reward_network.{member}')
 
 
