@@ -88,6 +88,11 @@ class Network(nn.Module):
         """The network."""
         raise NotImplementedError
 
+    @functools.cached_property
+    def _own(self) -> tuple[tuple[Tensor, ...], list[Step]]:
+        """Parameters and steps, collected once: a thousand gradients a second need them."""
+        return tuple(self.parameters()), self.steps()
+
     def table_parameters(self) -> tuple[Tensor, ...]:
         """The parameters `_table` depends on; they are the network's first."""
         return ()
@@ -114,14 +119,14 @@ class Network(nn.Module):
 
         Leaves no trace on the parameters, so that threads may share the network.
         """
-        parameters = tuple(self.parameters())
+        parameters, steps = self._own
         with torch.enable_grad():
             table, codes = self._table(actions)
             batch = Batch(inputs, initial, episode_start, _agents(inputs, actions), table, codes)
             if not kernels.usable(inputs):
-                objective, sums = loss(run_in_torch(self.steps(), batch)[0])
+                objective, sums = loss(run_in_torch(steps, batch)[0])
                 return torch.cat([part.reshape(-1) for part in torch.autograd.grad(objective, parameters)]), sums
-        flat, grad_table, sums = kernels.gradient(self.steps(), parameters, batch, loss.terms)
+        flat, grad_table, sums = kernels.gradient(steps, parameters, batch, loss.terms)
         if table is not None:
             parts = [part.reshape(-1) for part in torch.autograd.grad(table, self.table_parameters(), grad_table)]
             torch.cat(parts, out=flat[:sum(map(len, parts))])
@@ -156,7 +161,7 @@ class RecurrentNetwork(Network):
 def _joint_actions_of_others(num_agents: int, num_actions: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Everything each agent's others can do, as one-hot blocks [N A^(N-1), N A] with the agent's own block zero.
 
-    Agent i's row at the joint action a is sum_j a_j place[i, j] + first[i]; place [N, N], first [N].
+    Agent i's row at the joint action a is sum_j a_j place[j, i] + first[i]; place [N, N] float, first [N].
     """
     N, A = num_agents, num_actions
     weights = A ** torch.arange(N - 2, -1, -1, device=device)
@@ -164,7 +169,7 @@ def _joint_actions_of_others(num_agents: int, num_actions: int, device: torch.de
     hot, zero = functional.one_hot(digits, A).float(), torch.zeros(len(digits), 1, A, device=device)
     blocks = [torch.cat([hot[:, :i], zero, hot[:, i:]], 1).flatten(1) for i in range(N)]
     place = [torch.cat([weights[:i], weights.new_zeros(1), weights[i:]]) for i in range(N)]
-    return torch.cat(blocks), torch.stack(place), torch.arange(N, device=device) * len(digits)
+    return torch.cat(blocks), torch.stack(place, 1).float(), torch.arange(N, device=device) * len(digits)
 
 
 class RewardNetwork(Network):
@@ -201,7 +206,7 @@ class RewardNetwork(Network):
         if N * A ** (N - 1) <= _LOOK_UP_BELOW * actions.numel():
             hot, place, first = _joint_actions_of_others(N, A, actions.device)
             others = hot.to(self.action_bias.dtype) @ self.action_embedding
-            codes = (actions.unsqueeze(-2) * place).sum(-1) + first
+            codes = (actions.float() @ place).long() + first
         else:
             embedded = functional.embedding(actions + torch.arange(N, device=actions.device) * A, self.action_embedding)
             others = (embedded.sum(-2, keepdim=True) - embedded).flatten(0, 2)
