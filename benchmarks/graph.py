@@ -109,7 +109,7 @@ def medians(rounds: Sequence[dict[str, float]]) -> dict[str, float]:
 def measure(betas: Sequence[float] = (0.0, 0.95), robots: int = 3, worlds: int = 128, updates: int = 30,
             rounds: int = 3) -> dict:
     """For each beta: `graph` and `single_process` (steps_per_second, collecting and learning in ms), their `ratio`,
-    and `cpu_ms_per_tick` by node."""
+    `transport`, which is what collecting takes longer on the graph, and `cpu_ms_per_tick` by node."""
     os.environ.update(node_environment())
     results = {}
     for beta in betas:
@@ -123,8 +123,9 @@ def measure(betas: Sequence[float] = (0.0, 0.95), robots: int = 3, worlds: int =
                 run_single_process(settings, Path(scratch, f'single{turn}'))
                 single.append(timing(Path(scratch, f'single{turn}', 'run')))
         ratios = [one['steps_per_second'] / other['steps_per_second'] for one, other in zip(graph, single)]
+        transport = [one['collecting'] - other['collecting'] for one, other in zip(graph, single)]
         results[f'{beta:g}'] = {'ratio': statistics.median(ratios), 'ratios': ratios, 'graph': medians(graph),
-                                'single_process': medians(single),
+                                'single_process': medians(single), 'transport': statistics.median(transport),
                                 'cpu_ms_per_tick': {name: 1e3 * seconds for name, seconds in medians(cpu).items()}}
     return results
 
@@ -132,7 +133,7 @@ def measure(betas: Sequence[float] = (0.0, 0.95), robots: int = 3, worlds: int =
 def as_text(beta: str, found: dict) -> str:
     """What `measure` found for one beta, for people."""
     lines = [f'beta {beta}: the graph at {found["ratio"]:.3f} of the single process '
-             f'({", ".join(f"{ratio:.3f}" for ratio in found["ratios"])})']
+             f'({", ".join(f"{ratio:.3f}" for ratio in found["ratios"])}), transport {found["transport"]:.0f} ms']
     for name in ('graph', 'single_process'):
         one = found[name]
         lines.append(f'  {name.replace("_", " "):16}{one["steps_per_second"]:8.0f} steps/s'
