@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from dae_ros.learning.learner import Learner
 from dae_ros.learning.optimizer import FlatAdam
 from dae_ros.types import Trajectory, WorldSpec
 
+ROOT = Path(__file__).parents[1]
+ENVIRONMENT = os.environ | {'GLOO_SOCKET_IFNAME': 'lo', 'PYTHONPATH': f'{ROOT}{os.pathsep}{os.environ.get("PYTHONPATH", "")}'}
 SPEC = WorldSpec(num_agents=3, num_actions=4, observation_size=5, state_size=9, state_is_observations=False)
 
 SCRIPT = '''
@@ -91,7 +94,7 @@ def torchrun_command(*arguments):
 
 def run_in_two(*arguments):
     return subprocess.run(torchrun_command(*arguments), capture_output=True, text=True, timeout=240,
-                          env=os.environ | {'GLOO_SOCKET_IFNAME': 'lo'})
+                          env=ENVIRONMENT)
 
 
 @pytest.mark.parametrize('changes', [{'beta': 0.0}, {'num_mini_batches': 3, 'reward_network.architecture': 'shared_trunk',
@@ -134,8 +137,7 @@ except DaeRosError as error:
     print(error)
     sys.exit(3)
 ''')
-    environment = os.environ | {'WORLD_SIZE': '2', 'MASTER_ADDR': '127.0.0.1', 'MASTER_PORT': str(free_port()),
-                                'GLOO_SOCKET_IFNAME': 'lo'}
+    environment = ENVIRONMENT | {'WORLD_SIZE': '2', 'MASTER_ADDR': '127.0.0.1', 'MASTER_PORT': str(free_port())}
     leader, helper = (subprocess.Popen([sys.executable, str(script)], env=environment | {'RANK': rank},
                                        stdout=subprocess.PIPE, text=True) for rank in '01')
     leader.communicate(timeout=120)
