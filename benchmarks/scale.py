@@ -106,7 +106,8 @@ def plot(table: dict[str, dict[str, list[float]]], path: Path = PICTURE) -> None
     """Time above, memory below, one column per size, logarithmic."""
     figure = Figure(figsize=(11.0, 5.4), layout='constrained')
     FigureCanvasAgg(figure)
-    for (above, below), (size, curves) in zip(figure.subplots(2, len(table), sharex='col').T, table.items()):
+    panels = figure.subplots(2, len(table), sharex='col', sharey='row')
+    for (above, below), (size, curves) in zip(panels.T, table.items()):
         for axes in (above, below):
             plain(axes)
             axes.set(xscale='log', yscale='log')
@@ -118,10 +119,9 @@ def plot(table: dict[str, dict[str, list[float]]], path: Path = PICTURE) -> None
         above.set_title(TITLES[size], fontsize=10, color=INK)
         below.set_xticks(curves['values'], [f'{value:g}' for value in curves['values']], fontsize=8)
         below.minorticks_off()
-    axes = figure.axes
-    axes[0].set_ylabel('seconds')
-    axes[0].legend(fontsize=8, frameon=False)
-    axes[1].set_ylabel('peak memory [MiB]')
+    panels[0, 0].set_ylabel('seconds')
+    panels[0, 0].legend(fontsize=8, frameon=False)
+    panels[1, 0].set_ylabel('peak memory [MiB]')
     figure.savefig(path, dpi=150)
 
 
