@@ -67,7 +67,8 @@ def one_robot(rounds: int) -> dict[str, float]:
 
 PARTS: dict[str, Callable[[int], Any]] = {
     'training': training, 'graph': graph, 'learner': lambda rounds: learner.measure(repeats=rounds + 2), 'worlds': simulators,
-    'inference': one_robot}
+    'inference': one_robot, 'scale': lambda rounds: scale.measure()}
+UNASKED = tuple(name for name in PARTS if name != 'scale')
 
 
 def plot(found: dict[str, dict[str, float]]) -> None:
@@ -91,28 +92,28 @@ def plot(found: dict[str, dict[str, float]]) -> None:
     figure.savefig(PICTURE, dpi=150)
 
 
+PLOTS: dict[str, Callable[[Any], None]] = {'training': plot, 'scale': scale.plot}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog='make bench', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('parts', nargs='*', metavar='part',
-                        help=f'which of {", ".join((*PARTS, "scale"))}; without any, all but scale')
+                        help=f'which of {", ".join(PARTS)}; without any, all but scale')
     parser.add_argument('--rounds', type=int, default=3, help='turns of each training, graph and single process')
     options = parser.parse_args()
-    unknown = set(options.parts) - {*PARTS, 'scale'}
+    unknown = set(options.parts) - set(PARTS)
     if unknown:
         parser.error(f'there is no part {", ".join(sorted(unknown))}')
-    for name in options.parts or PARTS:
+    for name in options.parts or UNASKED:
         print(f'\n{name}', flush=True)
-        if name == 'scale':
-            scale.run()
-            continue
         bystanders = Bystanders(os.getpid())
         result = PARTS[name](options.rounds)
         others = bystanders.cores()
         if others > QUIET:
             print(f'  The machine was not quiet: other processes kept {others:.1f} cores busy.')
         merge(f'bench {name}', {'machine': description(), 'cores_of_others': round(others, 2), 'result': result})
-        if name == 'training':
-            plot(result)
+        if name in PLOTS:
+            PLOTS[name](result)
     print('\nkept in benchmarks/results.json')
 
 

@@ -14,15 +14,15 @@ import time
 from typing import Any, Callable, NamedTuple
 
 import dae_ros_nodes  # noqa: F401  sets the threads of the numerical libraries, as for the nodes
-import numpy as np
 import torch
 
 from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.learning import kernels, losses, networks
 from dae_ros.learning.chunks import shard_bounds
+from dae_ros.learning.device import random_trajectory
 from dae_ros.learning.learner import Learner
-from dae_ros.types import Trajectory, WorldSpec
+from dae_ros.types import WorldSpec
 
 STEPS = 25
 ARCHITECTURES = ('per_agent', 'shared_trunk')
@@ -50,18 +50,6 @@ def reward_flops(architecture: str, spec: WorldSpec, hidden: int, trunk: int) ->
     if architecture == 'per_agent':
         return 2 * (2 * spec.state_size * hidden + 3 * square + 3 * N * (6 * square + head))
     return 2 * (2 * (spec.state_size + N * A) * trunk + 3 * (6 * trunk**2 + trunk * hidden) + 3 * N * (square + head))
-
-
-def random_trajectory(spec: WorldSpec, worlds: int) -> Trajectory:
-    random = np.random.default_rng(0)
-    T, W, N, A = STEPS, worlds, spec.num_agents, spec.num_actions
-    episode_start, terminated = np.zeros((T + 1, W), bool), np.zeros((T, W), bool)
-    episode_start[0] = episode_start[-1] = terminated[-1] = True
-    return Trajectory(random.standard_normal((T, W, N, spec.observation_size), np.float32),
-                      random.standard_normal((T + 1, W, spec.state_size), np.float32), episode_start,
-                      random.integers(A, size=(T, W, N)), random.dirichlet(np.ones(A), (T, W, N)).astype(np.float32),
-                      random.standard_normal((T, W), np.float32), terminated, np.zeros((T, W), bool),
-                      np.zeros((0, spec.state_size), np.float32))
 
 
 def epoch(network: networks.Network, rows: int, inputs: int, spec: WorldSpec, chunks: int, length: int) -> Callable[[], None]:
@@ -106,7 +94,7 @@ def rows(spec: WorldSpec, settings: Settings, worlds: int) -> list[Row]:
     table = [Row(f'{name}, one epoch', steps * flops[name], 1,
                  epoch(network, count, width, spec, chunks, learner.chunk_length))
              for name, (network, count, width) in made.items()]
-    trajectory = random_trajectory(spec, worlds)
+    trajectory = random_trajectory(spec, worlds, STEPS)
     updates = {'beta 0': {'beta': 0.0}} | {f'beta 0.95, {a}': {'reward_network.architecture': a} for a in ARCHITECTURES}
     for name, changes in updates.items():
         # An epoch is one forward and two backward products; values, states and predictions take one forward pass more.

@@ -1,8 +1,8 @@
-"""python -m benchmarks.scale: time and memory of a rollout and of learning from it, as the work grows.
+"""make bench ARGS=scale: time and memory of a rollout and of learning from it, as the work grows.
 
 One size grows at a time from navigation with 3 robots, 128 worlds, 25 steps and hidden layers of 64 (128 in the reward
 network). Learning is one epoch of every network. Each point is a process of its own, so that its memory is its own. The
-exponent is the slope between the largest sizes in logarithms: 1 is proportional.
+exponent is the slope between the largest sizes in logarithms: 1 is proportional. Called by itself, this measures one point.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ import dae_ros_nodes  # noqa: F401  sets the threads of the numerical libraries,
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from benchmarks.machine import ROOT, description
-from benchmarks.results import merge
+from benchmarks.machine import ROOT
 from dae_ros import config
 from dae_ros.learning.learner import Learner
 from dae_ros.report.style import BLUE, FAINT, GREY, INK, ORANGE, plain
@@ -63,7 +62,7 @@ def point(changes: dict[str, Any]) -> dict[str, float]:
 
 def measured(changes: dict[str, Any]) -> dict[str, float]:
     """`point` in a process of its own."""
-    command = [sys.executable, '-m', 'benchmarks.scale', '--point', json.dumps(changes)]
+    command = [sys.executable, '-m', 'benchmarks.scale', json.dumps(changes)]
     return json.loads(subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout)
 
 
@@ -125,22 +124,10 @@ def plot(table: dict[str, dict[str, list[float]]], path: Path = PICTURE) -> None
     figure.savefig(path, dpi=150)
 
 
-def run() -> None:
-    """Measures, keeps and draws all."""
-    table = measure()
-    merge('scale', {'machine': description(), 'curves': table})
-    plot(table)
-    print(f'drawn in {PICTURE.relative_to(ROOT)}')
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--point', type=json.loads, help='measure one point with these settings, as JSON')
-    options = parser.parse_args()
-    if options.point is not None:
-        print(json.dumps(point(options.point)))
-        return
-    run()
+    parser.add_argument('point', type=json.loads, help='settings of the point, as JSON')
+    print(json.dumps(point(parser.parse_args().point)))
 
 
 if __name__ == '__main__':

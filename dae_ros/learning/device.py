@@ -24,7 +24,7 @@ def chosen_device(spec: WorldSpec, settings: Settings) -> torch.device:
     if name == 'cuda' and not torch.cuda.is_available():
         raise SettingsError('device is cuda, but torch finds no CUDA device here; use cpu or auto')
     if name == 'auto' and torch.cuda.is_available():
-        trajectory = _random_trajectory(spec, settings.task.num_worlds, settings.run.num_steps)
+        trajectory = random_trajectory(spec, settings.task.num_worlds, settings.run.num_steps)
         return min((torch.device('cpu'), torch.device('cuda')), key=lambda device: _seconds(spec, settings, trajectory, device))
     return torch.device('cpu' if name == 'auto' else name)
 
@@ -40,7 +40,7 @@ def _seconds(spec: WorldSpec, settings: Settings, trajectory: Trajectory, device
     return taken
 
 
-def _random_trajectory(spec: WorldSpec, num_worlds: int, num_steps: int) -> Trajectory:
+def random_trajectory(spec: WorldSpec, num_worlds: int, num_steps: int) -> Trajectory:
     """A rollout of one episode in the sizes of the run."""
     random = np.random.default_rng(0)
     T, W, (N, A, O, S, _) = num_steps, num_worlds, spec

@@ -129,10 +129,10 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
     the others; the table's gradient [K, O]; and the loss's sums [4], of which the kind of loss says how many there are.
     """
     flat = torch.zeros(sum(parameter.numel() for parameter in parameters))
-    offsets, offset = {}, flat.data_ptr()
+    gradients, address = {}, flat.data_ptr()
     for parameter in parameters:
-        offsets[parameter.data_ptr()] = offset
-        offset += 4 * parameter.numel()
+        gradients[parameter.data_ptr()] = address
+        address += 4 * parameter.numel()
     grad_table = None if batch.table is None else torch.zeros_like(batch.table)
     sums = torch.zeros(_MOST_SUMS, dtype=torch.float64)
     kept: list[Tensor] = []
@@ -146,7 +146,7 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
     data = [_array(x, shape, torch.float32, kept) for x in (*loss.data, None)[:2]]
     terms = _Loss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _array(loss.actions, agents, torch.int64, kept),
                   (_Array * 2)(*data), _array(loss.weights, columns, torch.float32, kept))
-    _check(library.network_gradient(_steps(steps, offsets), len(steps), _batch(steps, batch, kept), terms, _address(grad_table),
+    _check(library.network_gradient(_steps(steps, gradients), len(steps), _batch(steps, batch, kept), terms, _address(grad_table),
                                     sums.data_ptr()))
     return flat, grad_table, sums.float()
 

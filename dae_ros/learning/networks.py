@@ -108,10 +108,11 @@ class Network(nn.Module):
         inputs: [L, C, N or 1, I]. initial: [C, rows at the GRU, H]. episode_start: [L, C] bool. actions: [L, C, N] int64,
         for networks that see them. With gradients enabled this is torch; see `gradient`.
         """
+        _, steps = self._own
         batch = Batch(inputs, initial, episode_start, _agents(inputs, actions), *self._table(actions))
         if kernels.usable(inputs) and not torch.is_grad_enabled():
-            return kernels.forward(self.steps(), batch)
-        return run_in_torch(self.steps(), batch)
+            return kernels.forward(steps, batch)
+        return run_in_torch(steps, batch)
 
     def gradient(self, loss: Loss, inputs: Tensor, initial: Tensor, episode_start: Tensor,
                  actions: Tensor | None = None) -> tuple[Tensor, Tensor]:

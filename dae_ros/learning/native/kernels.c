@@ -429,7 +429,9 @@ typedef struct {
 
 /* Scratch space for one block at a time of all steps. */
 typedef struct {
-    float *products, *before, *carried, *gate_gradients;
+    float *products;                               /* reset, update, candidate from the input, candidate from the
+                                                      state: [4, BLOCK, COLUMNS] */
+    float *before, *carried, *gate_gradients;      /* [BLOCK, H] twice, [BLOCK, 4 H] */
     float *candidate, *middle, *state, *left;      /* left factors of outer products: [H], [2 H], [H] and O columns */
     float *right, *right_state;                    /* their right factors */
     float *bias;                                   /* [4 H] */
@@ -455,7 +457,7 @@ static void state_before(long rows, long H, const float *states, const uint8_t *
 /* What the backward pass needs of a row of a panel: candidate, reset, update, candidate from the state. */
 enum { GATES = 4 * COLUMNS };
 
-/* Gates, candidate and new state of a panel of at most COLUMNS units; products as in GruForward. In two passes, so that
+/* Gates, candidate and new state of a panel of at most COLUMNS units; products as in Scratch. In two passes, so that
  * the processor has many short chains of operations to overlap. */
 static void gates_panel(long rows, long columns, long H, float *products, const float *before, const float *bias_ih,
                         const float *bias_hh, float *states, float *gates) {
