@@ -11,6 +11,7 @@ there is.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -46,7 +47,7 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--workers', type=positive, default=len(os.sched_getaffinity(0)),
                         help='runs trained at a time; default: the cores there are, %(default)s')
     parser.add_argument('--short', action='store_true', help='see everything work in a minute: the first team of each figure, '
-                                                             'few worlds and updates; give --runs and --docs with it')
+                                                             'one seed, few worlds and updates; needs --runs and --docs')
     parser.add_argument('--runs', type=Path, default=ROOT / 'runs' / 'reproduce', help='folder of the runs')
     parser.add_argument('--docs', type=Path, default=ROOT / 'docs', help='folder of the results')
     parser.add_argument('--list', action='store_true', help='say what there is and how much of it is done, and train nothing')
@@ -57,12 +58,15 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def show(chosen: list[Figure], records: Records) -> None:
-    """A line for each figure: its runs, how many are done, and the core hours left at the speed of those done."""
-    for figure in chosen:
-        runs = figure.all_runs()
-        left = schedule.jobs(runs, records)
-        print(f'{figure.name:4} {figure.title}: {len(runs)} runs, {len(runs) - len(left)} done, '
-              f'{sum(job.run.steps - job.begins_at for job in left) / 1e6:.1f}M steps left')
+    """A line for each figure and one for all: how many runs are done, and the core hours left at the speed of those done."""
+    speed = records.speed()
+    everything = [run for figure in chosen for run in figure.all_runs()]
+    for name, runs in [*((f'{figure.name:4}{figure.title}', figure.all_runs()) for figure in chosen), ('all', everything)]:
+        todo = schedule.jobs(runs, records)
+        steps = sum(job.run.steps - job.begins_at for job in todo)
+        hours = sum(job.work(records.progress(job.run.name)[0]) for job in todo) / speed / 3600
+        print(f'{name}: {len(set(runs)) - len(todo)} of {len(set(runs))} runs done, {steps / 1e6:.1f}M steps left'
+              + (f', about {hours:.1f} core hours' if todo and math.isfinite(hours) else ''))
 
 
 def reproduce(chosen: list[Figure], workers: int, records: Records, docs: Path) -> int:

@@ -16,9 +16,8 @@ from dae_ros.config import TaskSettings
 from dae_ros.report.style import FAINT, GREY, INK, ROBOTS, compact, plain
 from dae_ros.worlds.yardsticks import yardstick_returns
 from reproduce.curves import Curves
-from reproduce.figures import Team
+from reproduce.figures import METRICS, Team
 
-METRIC_LABELS = {'mean_return': 'mean return of an episode', 'advantage/deviation': 'standard deviation of the advantages'}
 YARDSTICKS = ('random', 'greedy', 'best')
 YARDSTICK_EPISODES = 1000
 
@@ -36,7 +35,7 @@ def draw(curves: Curves, path: Path) -> None:
     for number, (row, places) in enumerate(zip(rows, panels)):
         for teams, axes, task in zip(row, places, figure.tasks if figure.average else [figure.tasks[number]] * columns):
             _panel(axes, curves, task, teams)
-    canvas.supylabel(METRIC_LABELS[figure.shows], fontsize=9, color=INK)
+    canvas.supylabel(METRICS[figure.shows], fontsize=9, color=INK)
     canvas.supxlabel('environment steps', fontsize=9, color=INK)
     handles = {}
     for axes in panels.flat:
@@ -56,19 +55,26 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     axes.xaxis.set_major_locator(MaxNLocator(5))
     sizes = ', '.join(str(team.num_agents) for team in teams)
     axes.set_title(f'{task}, N = {sizes or "none yet"}  {_seeds(curves, teams)}', loc='left', fontsize=9, color=INK)
-    for curve in figure.curves:
-        colour = ROBOTS[figure.palette.index(curve) % len(ROBOTS)]
-        band = curves.band(teams, curve, figure.shows)
-        if band is None:
-            continue
+    if figure.shows == 'mean_return' and teams:
+        _yardsticks(axes, curves, teams)
+    bands = {curve: band for curve in figure.curves if (band := curves.band(teams, curve, figure.shows)) is not None}
+    for curve, band in bands.items():
+        colour = _colour(curves, curve)
         axes.plot(band.steps, band.mean, color=colour, linewidth=1.5, label=curve)
-        axes.fill_between(band.steps, band.mean - band.half, band.mean + band.half, color=colour, alpha=0.2, linewidth=0)
         longer = curves.longer[teams[0], curve] if len(teams) == 1 else None
         if longer is not None:
             beyond = longer.steps >= band.steps[-1]
             axes.plot(longer.steps[beyond], longer.metrics[figure.shows][beyond], color=colour, linewidth=0.8, alpha=0.8)
-    if figure.shows == 'mean_return' and teams:
-        _yardsticks(axes, teams)
+    axes.margins(y=0.1)
+    limits = axes.get_ylim()
+    for curve, band in bands.items():
+        axes.fill_between(band.steps, band.mean - band.half, band.mean + band.half, color=_colour(curves, curve), alpha=0.2,
+                          linewidth=0)
+    axes.set_ylim(limits)  # of two seeds the interval can be wider than everything else there is to see
+
+
+def _colour(curves: Curves, curve: str) -> str:
+    return ROBOTS[curves.figure.palette.index(curve) % len(ROBOTS)]
 
 
 def _seeds(curves: Curves, teams: Sequence[Team]) -> str:
@@ -79,9 +85,10 @@ def _seeds(curves: Curves, teams: Sequence[Team]) -> str:
     return f'({counts[0]} seeds)' if len(counts) == 1 else f'({counts[0]} to {counts[-1]} seeds)'
 
 
-def _yardsticks(axes: Axes, teams: Sequence[Team]) -> None:
+def _yardsticks(axes: Axes, curves: Curves, teams: Sequence[Team]) -> None:
     """Thin lines at the returns of teams that learnt nothing, averaged over the team sizes."""
-    found = [_yardstick_returns(team.task, team.num_agents) for team in teams]
+    curve = next(iter(curves.figure.curves))
+    found = [_yardstick_returns(curves.figure.run(team, curve, 1).settings.task) for team in teams]
     for name in [name for name in YARDSTICKS if name in found[0]]:
         height = np.mean([returns[name][0] for returns in found])
         axes.axhline(height, color=GREY, linewidth=0.8, linestyle=(0, (5, 3)), zorder=1)
@@ -90,5 +97,5 @@ def _yardsticks(axes: Axes, teams: Sequence[Team]) -> None:
 
 
 @lru_cache(maxsize=None)
-def _yardstick_returns(task: str, num_agents: int) -> dict[str, tuple[float, float]]:
-    return yardstick_returns(TaskSettings(task=task, num_agents=num_agents), YARDSTICK_EPISODES, seed=1)
+def _yardstick_returns(task: TaskSettings) -> dict[str, tuple[float, float]]:
+    return yardstick_returns(task, YARDSTICK_EPISODES, seed=1)

@@ -16,7 +16,8 @@ from dae_ros.errors import SettingsError
 FOLDER = ROOT / 'config' / 'figures'
 # One thread each: side by side, runs use the cores better than a learner's threads do.
 EVERY_RUN = {'device': 'cpu', 'learner_threads': 1}
-SHORT_UPDATES, SHORT_SEEDS = 2, 2
+METRICS = {'mean_return': 'mean return of an episode', 'advantage/deviation': 'standard deviation of the advantages'}
+SHORT_STEPS = 200  # of each run
 SHORT = {'num_worlds': 4, 'epochs': 1, 'reward_network.epochs': 1, 'evaluation_episodes': 8}
 
 
@@ -84,14 +85,13 @@ class Figure:
         changes = self.curves[curve]
         values = {**config.load_task_file(ROOT / 'config' / f'{team.task}.yaml'), **EVERY_RUN, **(SHORT if self.short else {}),
                   **changes, 'num_agents': team.num_agents, 'seed': seed, 'total_steps': steps or team.steps}
-        settings = config.from_flat(values)
-        if self.short:
-            settings = replace(settings, run=replace(settings.run, total_steps=SHORT_UPDATES * settings.task.num_worlds
-                                                     * settings.run.num_steps))
-        known = config.flatten(settings)
-        different = '_'.join(f'{name}-{known[name]:g}' if isinstance(known[name], float) else f'{name}-{known[name]}'
-                             for name in sorted(changes))
-        return Run(f'{team.task}_n{team.num_agents}_{different}_seed{seed}', settings)
+        try:
+            settings = config.from_flat(values)
+        except SettingsError as error:
+            raise SettingsError(f'curve {curve} of figure {self.name}: {error}') from error
+        # Named after its settings, not after a figure or a curve, so that figures share it.
+        different = ''.join(f'_{name}-{_text(config.flatten(settings)[name])}' for name in sorted(changes))
+        return Run(f'{team.task}_n{team.num_agents}{different}_seed{seed}', settings)
 
     def runs(self, team: Team, curve: str) -> list[Run]:
         """One for each seed."""
@@ -112,7 +112,7 @@ def load(names: list[str], seeds: int | None = None, steps: int | None = None, s
          folder: Path = FOLDER) -> list[Figure]:
     """The figures of these names, all without any; `seeds` and `steps` replace those declared, for every team.
 
-    short: the first team of each figure only, two seeds, a few worlds and updates.
+    short: only the first team of each figure, with one seed, a few worlds and updates, where nothing else is asked for.
     Raises SettingsError if a declaration is not as it should be or there is no such figure.
     """
     figures = {figure.name: figure for path in sorted(folder.glob('*.yaml')) for figure in _figures_of(path)}
@@ -123,12 +123,18 @@ def load(names: list[str], seeds: int | None = None, steps: int | None = None, s
 
 
 def _resized(figure: Figure, seeds: int | None, steps: int | None, short: bool) -> Figure:
-    teams = [replace(team, seeds=seeds or team.seeds) for team in figure.teams]
+    teams = figure.teams
+    if short:
+        teams, seeds, steps = teams[:1], seeds or 1, steps or SHORT_STEPS
+    if seeds:
+        teams = [replace(team, seeds=seeds) for team in teams]
     if steps:
         teams = [replace(team, steps=steps, first_seed_steps=steps) for team in teams]
-    if short:
-        teams = [replace(team, seeds=SHORT_SEEDS, first_seed_steps=team.steps) for team in teams[:1]]
     return replace(figure, teams=tuple(teams), short=short)
+
+
+def _text(value: Any) -> str:
+    return f'{value:g}' if isinstance(value, float) else str(value)
 
 
 def _figures_of(path: Path) -> list[Figure]:
@@ -141,9 +147,13 @@ def _figures_of(path: Path) -> list[Figure]:
         origin = f'figure {name} in {path}'
         parts = _fields(_mapping(declared, origin), origin, {'title': str, 'shows': str, 'curves': list},
                         {'average': bool, 'threshold': float, 'baseline': str})
-        unknown = [curve for curve in [*parts['curves'], parts['baseline']] if curve is not None and curve not in curves]
-        if unknown:
-            raise SettingsError(f'{origin} names the curve {unknown[0]!r}, which is not under curves')
+        for curve in parts['curves']:
+            if curve not in curves:
+                raise SettingsError(f'{origin} names the curve {curve!r}, which is not under curves')
+        if parts['baseline'] not in (None, *parts['curves']):
+            raise SettingsError(f'{origin} has the baseline {parts["baseline"]!r}, which is none of its curves')
+        if parts['shows'] not in METRICS:
+            raise SettingsError(f'{origin} cannot show {parts["shows"]!r}; known are {", ".join(METRICS)}')
         figures.append(Figure(str(name), parts['title'], parts['shows'], {curve: curves[curve] for curve in parts['curves']},
                               teams, bool(parts['average']), parts['threshold'], parts['baseline'], tuple(curves),
                               short=False))
@@ -153,8 +163,8 @@ def _figures_of(path: Path) -> list[Figure]:
 def _team(path: Path, task: str, size: Any, declared: Any) -> Team:
     origin = f'team {task} of {size} in {path}'
     parts = _fields(_mapping(declared, origin), origin, {'seeds': int, 'steps': int}, {'first_seed_steps': int})
-    if type(size) is not int:
-        raise SettingsError(f'{origin}: a team size must be an integer')
+    if type(size) is not int or parts['seeds'] < 1 or parts['steps'] < 1:
+        raise SettingsError(f'{origin}: team size, seeds and steps must be integers of at least 1')
     return Team(task, size, parts['seeds'], parts['steps'], parts['first_seed_steps'] or parts['steps'])
 
 
@@ -171,13 +181,17 @@ def _mapping(value: Any, origin: str) -> dict[Any, Any]:
     return value
 
 
-def _fields(values: dict[Any, Any], origin: str, needed: Mapping[str, type], optional: Mapping[str, type] = {}) -> dict[str, Any]:
-    """`values`, None for what is optional and missing. Raises SettingsError for a key that is unknown, missing or of another type."""
+def _fields(values: dict[Any, Any], origin: str, needed: Mapping[str, type],
+            optional: Mapping[str, type] = {}) -> dict[str, Any]:
+    """`values`, None for what is optional and missing.
+
+    Raises SettingsError for a key that is unknown, missing or of another type.
+    """
     kinds = {**needed, **optional}
     for name, value in values.items():
         if name not in kinds:
             raise SettingsError(f'{origin} has the unknown key {name!r}; known are {", ".join(kinds)}')
-        if type(value) is not kinds[name]:
+        if type(value) is not kinds[name] and (kinds[name] is not float or type(value) is not int):
             raise SettingsError(f'{origin}: {name} must be of type {kinds[name].__name__}, not {value!r}')
     for name in needed:
         if name not in values:

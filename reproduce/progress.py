@@ -1,4 +1,4 @@
-"""Shows how the runs get on: a bar for all and one for each that is being trained, or plain lines where there is no terminal."""
+"""Shows how the runs get on: a bar for all and one for each in training, or plain lines where there is no terminal."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,12 @@ class Records:
         """Of the end at exactly its steps; None if it went past them without one."""
         file = finished_file(self.path(run), run.steps)
         return json.loads(file.read_text()) if file.exists() else None
+
+    def speed(self) -> float:
+        """Robot steps per second and core, over all runs that came to an end; nan if none did."""
+        found = [json.loads(file.read_text()) for file in self.folder.glob('*/finished_*.json')]
+        work = sum(facts['environment_steps'] * facts['settings']['num_agents'] for facts in found)
+        return work / sum(facts['seconds'] for facts in found) if found else math.nan
 
     def metrics(self, run: Run) -> dict[str, np.ndarray]:
         """Columns of a finished run's metrics up to its steps, [rows] by name."""

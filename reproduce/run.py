@@ -12,6 +12,7 @@ import os
 import platform
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Mapping
 
@@ -37,10 +38,10 @@ class Stopped(Exception):
     """The run was asked to stop before its end; its checkpoint is written."""
 
 
-def run(path: Path, settings: Settings) -> None:
+def run(path: Path, settings: Settings, stopping: Callable[[], bool]) -> None:
     """Trains and evaluates in the folder `path` and writes its facts.
 
-    Raises Stopped after SIGINT or SIGTERM, or when its parent is gone, and DaeRosError if the folder is another run's.
+    Raises Stopped once `stopping` holds, and RunFolderError if the folder is another run's or is in use.
     """
     path.mkdir(parents=True, exist_ok=True)
     with open(path / 'lock', 'w') as lock:
@@ -48,20 +49,18 @@ def run(path: Path, settings: Settings) -> None:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise RunFolderError(f'{path} is being trained by another process') from error
-        _train(path, settings)
+        _train(path, settings, stopping)
 
 
-def _train(path: Path, settings: Settings) -> None:
-    stopping, parent, ran_on = [], os.getppid(), description()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopping.append(True))
+def _train(path: Path, settings: Settings, stopping: Callable[[], bool]) -> None:
+    ran_on = description()  # the commit may be another one by the end
     _adopt(path, settings)
     worlds = make_worlds(settings.task)
     training = Training(settings, worlds.spec, RunFolder(path, settings))
 
     def on_update() -> None:
         # Only between updates is there a state that the run can go on from with the same weights.
-        if stopping or os.getppid() != parent:
+        if stopping():
             training.save()
             raise Stopped
 
@@ -101,8 +100,12 @@ def versions() -> dict[str, str]:
 
 def main() -> None:
     os.nice(NICENESS)
+    asked, parent = [], os.getppid()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: asked.append(True))
     try:
-        run(Path(sys.argv[1]), config.from_flat(json.loads(sys.argv[2])))
+        # Without its parent nobody would stop it, and it would hold the lock.
+        run(Path(sys.argv[1]), config.from_flat(json.loads(sys.argv[2])), lambda: bool(asked) or os.getppid() != parent)
     except Stopped:
         sys.exit('stopped; it goes on from here when it is started again')
     except DaeRosError as error:

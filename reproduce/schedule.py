@@ -47,7 +47,8 @@ def jobs(runs: Sequence[Run], records: Records) -> list[Job]:
     return sorted(todo, key=lambda job: (job.begins_at > 0, job.run.seed, job.work(0)))
 
 
-def train(todo: Sequence[Job], workers: int, records: Records, progress: Progress, on_finished: Callable[[], None]) -> list[Run]:
+def train(todo: Sequence[Job], workers: int, records: Records, progress: Progress,
+          on_finished: Callable[[], None]) -> list[Run]:
     """Trains `workers` runs at a time; calls `on_finished` after each. Returns those that failed.
 
     Whatever ends it, such as KeyboardInterrupt, the processes are stopped, and write their checkpoints, before it returns.

@@ -13,16 +13,15 @@ from dae_ros.config import Settings
 from dae_ros.files import write_atomically
 from dae_ros.report.style import signed
 from reproduce.curves import Curves, Seed
-from reproduce.draw import METRIC_LABELS
-from reproduce.figures import Team
+from reproduce.figures import METRICS, Team
 from reproduce.records import Records
 from reproduce.statistics import mean_and_interval, steps_to_reach
 
 END_SHARE = 0.05  # of a training, over which its last return is averaged
 HEADER = '''# Results
 
-The paper's figures, trained and drawn again by `make reproduce`. Lines and numbers are means over seeds, bands and ± their 95 %
-intervals (Student's t).
+The paper's figures, trained and drawn again by `make reproduce`. Lines and numbers are means over seeds, bands and ± their
+95 % intervals (Student's t).
 '''
 
 
@@ -45,10 +44,13 @@ def write_block(path: Path, name: str, block: str) -> None:
 def figure_block(curves: Curves, records: Records) -> str:
     """All that is told of one figure: picture, tables, settings, versions and machine."""
     figure = curves.figure
-    facts = [fact for seed in _all_seeds(curves) if (fact := records.facts(seed.run)) is not None]
+    # A run that went on counts once, with all its time.
+    facts = [*{seed.run.name: fact for seed in _all_seeds(curves) if (fact := records.facts(seed.run)) is not None}.values()]
     parts = [f'**{figure.title}.** Data: [results/{figure.name}.csv](results/{figure.name}.csv).',
              f'![{figure.title}](results/{figure.name}.png)', _results(curves, records)]
-    if figure.baseline:
+    if figure.threshold is not None:
+        parts.append(_thresholds(curves))
+    if figure.baseline is not None:
         parts.append(_differences(curves))
     parts.append('\n'.join([*_settings(curves), *_origins(facts)]))
     return '\n\n'.join(part for part in parts if part)
@@ -70,31 +72,38 @@ def _all_seeds(curves: Curves) -> list[Seed]:
 
 def _results(curves: Curves, records: Records) -> str:
     figure, rows = curves.figure, []
-    head = ['task', 'N', 'curve', 'seeds', 'steps', f'{METRIC_LABELS[figure.shows]}, last 5 %', 'greedy, at the end']
-    if figure.threshold is not None:
-        head.append(f'steps to {figure.threshold:g}')
     for task, teams in _groups(curves):
-        reached = {}
         for curve in figure.curves:
-            band = curves.band(teams, curve, figure.shows)
-            if band is None:
-                continue
             groups = [curves.seeds[team, curve] for team in teams]
-            cells = [task, _sizes(teams), curve, _counts(curves, teams, curve), f'{groups[0][0].run.steps:,}',
-                     _number(*_interval(groups, lambda seed: last(seed.metrics[figure.shows]))),
-                     _number(*_interval(groups, lambda seed: _evaluation(seed, records)))]
-            if figure.threshold is not None:
-                reached[curve] = steps_to_reach(figure.threshold, band.steps, band.mean)
-                cells.append(_reached(reached.get(figure.baseline), reached[curve], band.steps[-1]))
-            rows.append(cells)
+            if groups and all(groups):
+                rows.append(_row(curves, records, task, teams, curve, groups, _counts(curves, teams, curve)))
             longer = curves.longer[teams[0], curve] if len(teams) == 1 else None
             if longer is not None:
-                cells = [task, _sizes(teams), curve, f'seed {longer.run.seed} alone', f'{longer.run.steps:,}',
-                         _number(last(longer.metrics[figure.shows]), np.nan), _number(_evaluation(longer, records), np.nan)]
-                if figure.threshold is not None:
-                    cells.append('')
-                rows.append(cells)
-    return _table(head, rows)
+                rows.append(_row(curves, records, task, teams, curve, [[longer]], f'seed {longer.run.seed} alone'))
+    return _table(['task', 'N', 'curve', 'seeds', 'steps', f'{METRICS[figure.shows]}, last 5 %', 'greedy, at the end'], rows)
+
+
+def _row(curves: Curves, records: Records, task: str, teams: Sequence[Team], curve: str, groups: Sequence[Sequence[Seed]],
+         seeds: str) -> list[str]:
+    """One curve's numbers at the end of training, over the seeds of each team."""
+    return [task, _sizes(teams), curve, seeds, f'{groups[0][0].run.steps:,}',
+            _number(*_interval(groups, lambda seed: last(seed.metrics[curves.figure.shows]))),
+            _number(*_interval(groups, lambda seed: _evaluation(seed, records)))]
+
+
+def _thresholds(curves: Curves) -> str:
+    """How soon the mean over the seeds, smoothed, reaches the figure's threshold, and how much sooner than the baseline."""
+    figure, rows = curves.figure, []
+    for task, teams in _groups(curves):
+        bands = {curve: band for curve in figure.curves if (band := curves.band(teams, curve, figure.shows)) is not None}
+        reached = {curve: steps_to_reach(figure.threshold, band.steps, band.mean) for curve, band in bands.items()}
+        baseline = reached.get(figure.baseline)
+        for curve, steps in reached.items():
+            told = f'{steps:,.0f}' if steps is not None else f'not within {bands[curve].steps[-1]:,.0f}'
+            ratio = f'{baseline / steps:.2f}' if baseline is not None and steps is not None else ''
+            rows.append([task, _sizes(teams), curve, _counts(curves, teams, curve), told, ratio])
+    return _table(['task', 'N', 'curve', 'seeds', f'steps to a mean return of {figure.threshold:g}',
+                   f'steps of {figure.baseline} / its own'], rows)
 
 
 def _differences(curves: Curves) -> str:
@@ -104,9 +113,10 @@ def _differences(curves: Curves) -> str:
         for curve in figure.curves:
             pairs = [_pairs(curves, team, curve) for team in teams]
             if curve != figure.baseline and pairs and all(map(len, pairs)):
-                rows.append([task, _sizes(teams), f'{curve} − {figure.baseline}', ' + '.join(str(len(pair)) for pair in pairs),
-                             _number(*mean_and_interval(pairs))])
-    return rows and _table(['task', 'N', 'difference, paired by seed', 'pairs', f'{METRIC_LABELS[figure.shows]}, last 5 %'], rows)
+                seeds = ' + '.join(str(len(pair)) for pair in pairs)
+                rows.append([task, _sizes(teams), f'{curve} − {figure.baseline}', seeds, _number(*mean_and_interval(pairs))])
+    head = ['task', 'N', 'difference, paired by seed', 'seeds', f'{METRICS[figure.shows]}, last 5 %']
+    return _table(head, rows) if rows else ''
 
 
 def _pairs(curves: Curves, team: Team, curve: str) -> np.ndarray:
@@ -129,13 +139,6 @@ def _evaluation(seed: Seed, records: Records) -> float:
     facts = records.facts(seed.run)
     found = None if facts is None else facts['evaluation_return']
     return np.nan if found is None else found
-
-
-def _reached(baseline: float | None, steps: float | None, end: float) -> str:
-    if steps is None:
-        return f'not within {end:,.0f}'
-    share = f' ({baseline / steps:.1f} times as fast as the baseline)' if baseline and baseline != steps else ''
-    return f'{steps:,.0f}{share}'
 
 
 def _counts(curves: Curves, teams: list[Team], curve: str) -> str:
@@ -165,7 +168,8 @@ def _settings(curves: Curves) -> list[str]:
     figure, lines = curves.figure, []
     for task in figure.tasks:
         common = _changed(figure.run(figure.sizes(task)[0], figure.baseline or next(iter(figure.curves)), 1).settings)
-        for name in ('task', 'num_agents', 'seed', 'total_steps', *(name for curve in figure.curves.values() for name in curve)):
+        varied = {name for changes in figure.curves.values() for name in changes}
+        for name in {'task', 'num_agents', 'seed', 'total_steps'} | varied:
             common.pop(name, None)
         lines.append(f'- Settings of {task} (`config/{task}.yaml`) other than the defaults: {_listed(common) or "none"}.')
     told = '; '.join(f'{curve}: {_listed(changes)}' for curve, changes in figure.curves.items())
