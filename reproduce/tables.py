@@ -190,5 +190,5 @@ def _origins(facts: Sequence[dict[str, Any]]) -> list[str]:
     versions = {', '.join(f'{name} {version}' for name, version in fact['versions'].items()) for fact in facts}
     commits = {fact['machine']['commit'] for fact in facts}
     hours = sum(fact['seconds'] for fact in facts) / 3600
-    return [f'- {len(facts)} runs, {hours:.1f} hours of one core altogether, on {"; ".join(sorted(machines))}.',
+    return [f'- {len(facts)} runs, {hours:.1f} hours of training in one thread each, on {"; ".join(sorted(machines))}.',
             f'- Versions: {"; ".join(sorted(versions))}. Commit: {", ".join(sorted(commits))}.']
