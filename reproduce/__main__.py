@@ -28,7 +28,7 @@ from reproduce.progress import Progress
 from reproduce.records import Records
 from reproduce.results import write_results
 
-REFRESH_PERIOD = 60.0  # s between two drawings while runs are being trained
+REFRESH_PERIOD = 600.0  # s at least between two drawings, which take some seconds, while runs are being trained
 
 
 def positive(text: str) -> int:

@@ -54,17 +54,18 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     axes.xaxis.set_major_formatter(compact)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     sizes = ', '.join(str(team.num_agents) for team in teams)
-    axes.set_title(f'{task}, N = {sizes or "none yet"}  {_seeds(curves, teams)}', loc='left', fontsize=9, color=INK)
+    longer = {curve: curves.longer[teams[0], curve] for curve in figure.curves} if len(teams) == 1 else {}
+    alone = '; thin: seed 1 alone' if any(longer.values()) else ''
+    axes.set_title(f'{task}, N = {sizes or "none yet"}   {_seeds(curves, teams)}{alone}', loc='left', fontsize=9, color=INK)
     if figure.shows == 'mean_return' and teams:
         _yardsticks(axes, curves, teams)
     bands = {curve: band for curve in figure.curves if (band := curves.band(teams, curve, figure.shows)) is not None}
     for curve, band in bands.items():
         colour = _colour(curves, curve)
         axes.plot(band.steps, band.mean, color=colour, linewidth=1.5, label=curve)
-        longer = curves.longer[teams[0], curve] if len(teams) == 1 else None
-        if longer is not None:
-            beyond = longer.steps >= band.steps[-1]
-            axes.plot(longer.steps[beyond], longer.metrics[figure.shows][beyond], color=colour, linewidth=0.8, alpha=0.8)
+        if (seed := longer.get(curve)) is not None:
+            beyond = seed.steps >= band.steps[-1]
+            axes.plot(seed.steps[beyond], seed.metrics[figure.shows][beyond], color=colour, linewidth=0.8, alpha=0.8)
     axes.margins(y=0.1)
     limits = axes.get_ylim()
     for curve, band in bands.items():
@@ -82,7 +83,9 @@ def _seeds(curves: Curves, teams: Sequence[Team]) -> str:
     counts = sorted({count for curve in curves.figure.curves for count in curves.counts(teams, curve) if count})
     if not counts:
         return ''
-    return f'({counts[0]} seeds)' if len(counts) == 1 else f'({counts[0]} to {counts[-1]} seeds)'
+    if len(counts) > 1:
+        return f'{counts[0]} to {counts[-1]} seeds'
+    return '1 seed' if counts == [1] else f'{counts[0]} seeds'
 
 
 def _yardsticks(axes: Axes, curves: Curves, teams: Sequence[Team]) -> None:

@@ -17,7 +17,7 @@ from reproduce.figures import Run
 from reproduce.progress import Progress
 from reproduce.records import Records
 
-POLL_PERIOD = 0.5    # s
+POLL_PERIOD = 1.0    # s
 STOP_TIMEOUT = 60.0  # s a run gets to write its checkpoint
 LOG_TAIL = 8         # lines of a failed run's log that are shown
 

@@ -80,7 +80,8 @@ def _results(curves: Curves, records: Records) -> str:
             longer = curves.longer[teams[0], curve] if len(teams) == 1 else None
             if longer is not None:
                 rows.append(_row(curves, records, task, teams, curve, [[longer]], f'seed {longer.run.seed} alone'))
-    return _table(['task', 'N', 'curve', 'seeds', 'steps', f'{METRICS[figure.shows]}, last 5 %', 'greedy, at the end'], rows)
+    head = ['task', 'N', 'curve', 'seeds', 'steps', f'{METRICS[figure.shows]}, last 5 %', 'return at the end, greedy']
+    return _table(head, rows)
 
 
 def _row(curves: Curves, records: Records, task: str, teams: Sequence[Team], curve: str, groups: Sequence[Sequence[Seed]],
