@@ -24,7 +24,7 @@ class MatrixGame(SynchronousWorlds):
         if task.observe_others:
             raise SettingsError('observe_others belongs to formation and line; set it to false for the matrix game')
         spec = WorldSpec(num_agents, num_agents, num_agents, num_agents, state_is_observations=False)
-        super().__init__(spec, task.num_worlds, task.episode_steps or num_agents)
+        super().__init__(spec, task, task.episode_steps or num_agents)
         self._turn = 0  # step of the episode, and the agent whose action counts there
         self._reward = np.zeros(task.num_worlds)
 

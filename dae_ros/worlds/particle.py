@@ -42,7 +42,7 @@ class ParticleWorlds(SynchronousWorlds):
         num_others = num_agents - 1 if observe_others else 0
         size = 4 + 2 * num_landmarks + 2 * num_others + unused_features
         spec = WorldSpec(num_agents, ACTION_FORCE.shape[1], size, num_agents * size, state_is_observations=True)
-        super().__init__(spec, num_worlds, task.episode_steps or EPISODE_STEPS)
+        super().__init__(spec, task, task.episode_steps or EPISODE_STEPS)
 
         # The observations, worlds last, are also where the state lives: the arrays below are views into them.
         self._features = np.zeros((num_agents, size, num_worlds))
