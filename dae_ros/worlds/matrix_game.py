@@ -32,11 +32,20 @@ class MatrixGame(SynchronousWorlds):
         self._turn = 0
 
     def advance(self, actions: np.ndarray) -> None:
-        self._reward = actions[:, self._turn] + 1 - (self.spec.num_agents + 1) / 2
+        self._reward = self._reward_of(actions[:, self._turn])
         self._turn += 1
 
     def reward(self) -> np.ndarray:
         return self._reward
+
+    def alternatives(self, actions: np.ndarray) -> np.ndarray:
+        num_agents, num_actions = self.spec.num_agents, self.spec.num_actions
+        rewards = np.tile(self._reward_of(actions[:, self._turn]), (num_agents, num_actions, 1))
+        rewards[self._turn] = self._reward_of(np.arange(num_actions))[:, None]
+        return rewards
+
+    def _reward_of(self, action: np.ndarray) -> np.ndarray:
+        return action + 1 - (self.spec.num_agents + 1) / 2
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
         observations = np.zeros((self.num_worlds, self.spec.num_agents, self.spec.observation_size), dtype=np.float32)

@@ -38,9 +38,7 @@ class SynchronousWorlds(Worlds):
 
     def step(self, actions: np.ndarray) -> Transition:
         """As `Worlds.step`. Raises ValueError on actions of another shape, type or range, WorldError before `reset`."""
-        if self._rollout_key is None:
-            raise WorldError('the worlds must be reset before their first step')
-        self.advance(check_actions(actions, self.num_worlds, self.spec))
+        self.advance(self._check(actions))
         reward = self._pay(self._owed, self.reward())
         ended = self._at_last_step
         self._steps += 1
@@ -51,6 +49,22 @@ class SynchronousWorlds(Worlds):
             final_states=np.empty((0, self.spec.state_size), dtype=np.float32),
             next=self._begin_episodes() if ended else self._joint_observation(episode_start=False),
         )
+
+    def alternative_rewards(self, actions: np.ndarray) -> np.ndarray:
+        """The reward this step would pay if agent i took action a and the others theirs of `actions` [W, N]: [W, N, A] float64.
+
+        The entries of the actions taken are what `step` then pays, before it rounds to float32. With a `reward_delay`, it
+        makes a difference what an agent does only at an episode's last step: any other pays what was earned earlier.
+        Changes nothing. Raises as `step`.
+        """
+        earned = self.alternatives(self._check(actions))
+        paid = self._pay(self._owed.copy(), earned)
+        return np.broadcast_to(paid, earned.shape).transpose(2, 0, 1).copy()
+
+    def _check(self, actions: np.ndarray) -> np.ndarray:
+        if self._rollout_key is None:
+            raise WorldError('the worlds must be reset before their first step')
+        return check_actions(actions, self.num_worlds, self.spec)
 
     @property
     def _at_last_step(self) -> bool:
@@ -87,6 +101,11 @@ class SynchronousWorlds(Worlds):
     @abstractmethod
     def reward(self) -> np.ndarray:
         """The reward [W], float64, that the team earned by what `advance` did; in memory that no later step touches."""
+
+    @abstractmethod
+    def alternatives(self, actions: np.ndarray) -> np.ndarray:
+        """The `reward` that `advance` would lead to if agent i took action a and all others theirs of the checked joint
+        actions [W, N]: [N, A, W] float64. Changes nothing."""
 
     @abstractmethod
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
