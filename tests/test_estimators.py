@@ -219,3 +219,16 @@ def test_the_reward_network_says_what_it_expects_of_a_rollout_and_others_say_tha
         learner(replace(LEARNER, beta=0.0), REWARD).expected_rewards(trajectory)
     with pytest.raises(ValueError, match='estimator = coma there is no reward network'):
         learner(COMA, REWARD).expected_rewards(trajectory)
+
+
+@pytest.mark.parametrize('architecture', ['per_agent', 'shared_trunk'])
+@pytest.mark.parametrize('recurrent', [True, False])
+def test_a_reward_network_without_memory_forgets_earlier_steps(recurrent, architecture, learner):
+    dae = learner(LEARNER, replace(REWARD, recurrent=recurrent, architecture=architecture))
+    one = random_trajectory(terminations=0, truncations=0)
+    other = one._replace(states=one.states.copy(), actions=one.actions.copy())
+    other.states[0] += 1
+    other.actions[0] = (other.actions[0] + 1) % SPEC.num_actions
+    dae.update(one, 0)
+    differs = (dae.expected_rewards(one) != dae.expected_rewards(other)).any(axis=(1, 2))
+    assert differs[0] and (differs[1:] == recurrent).all()

@@ -93,7 +93,8 @@ class DifferenceEstimator:
                                                  settings.gae_lambda)
         estimated = team.unsqueeze(-1).expand(data.actions.shape)
         if self._reward:
-            predicted, inputs, states = self._predicted_rewards(data)
+            remembered = self._remembered(data)
+            predicted, inputs, states = self._predicted_rewards(remembered)
             expected = advantages.expected_rewards(predicted, data.probabilities)
             estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
                                                                 settings.gae_lambda)
@@ -101,7 +102,7 @@ class DifferenceEstimator:
             error = (taken - data.rewards.unsqueeze(-1)).square().mean()
             metrics['reward_network/explained_variance'] = float(
                 1 - error / data.rewards.var(correction=0).clamp_min(1e-12))
-            trainings = self._reward_trainings(data, inputs, states, rollout)
+            trainings = self._reward_trainings(remembered, inputs, states, rollout)
 
         # Line 20: value targets; the critic sees one state per world, so it regresses on the agents' mean.
         targets = values[:-1] + (estimated.mean(-1) if settings.value_target == 'difference' else team)
@@ -116,7 +117,7 @@ class DifferenceEstimator:
         """E over a_i ~ pi_i of the predicted reward, [T, W, N]. Raises ValueError at beta = 0, which has no reward network."""
         if not self._reward:
             raise ValueError('at beta = 0 there is no reward network')
-        return advantages.expected_rewards(self._predicted_rewards(data)[0], data.probabilities)
+        return advantages.expected_rewards(self._predicted_rewards(self._remembered(data))[0], data.probabilities)
 
     def networks(self) -> dict[str, FlatAdam]:
         return {'critic': self._critic} | {member.name: member.adam for member in self._reward}
@@ -138,6 +139,12 @@ class DifferenceEstimator:
             ongoing = torch.zeros(1, len(data.final_states), dtype=torch.bool, device=outputs.device)
             final_values = critic(data.final_states[None, :, None], hidden[:-1][data.truncated], ongoing)[0].view(-1)
         return outputs.flatten(1), hidden, final_values
+
+    def _remembered(self, data: Trajectory) -> Trajectory:
+        """The rollout as far as the reward networks remember it: without memory, every step begins an episode."""
+        if self._reward_settings.recurrent:
+            return data
+        return data._replace(episode_start=torch.ones_like(data.episode_start))
 
     def _predicted_rewards(self, data: Trajectory) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The ensemble's mean prediction [T, W, N, A], what it is made from, and each member's recurrent states."""
