@@ -2,7 +2,7 @@
 # PYTHON names the interpreter for .venv; without it, set-up takes the first suitable one it finds.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help build demo test bench bench-peers lint lock clean
+.PHONY: help build demo test bench bench-peers reproduce lint lock clean
 export PYTHON
 
 help:  ## list the targets
@@ -22,6 +22,9 @@ bench: build  ## measure speeds and phases on this machine; ARGS names parts, su
 
 bench-peers: build  ## compare with BenchMARL, VMAS, JaxMARL and mpe2; ARGS='--jaxmarl /path/to/checkout --rounds 5'
 	@. scripts/env.sh && exec python -m benchmarks.peers $(ARGS)
+
+reproduce: build  ## train and draw the paper's figures; figure='1b 4' seeds=5 steps=200000 workers=2, ARGS=--list
+	@. scripts/env.sh && exec python -m reproduce $(figure) $(foreach option,seeds steps workers,$(if $($(option)),--$(option) $($(option)))) $(ARGS)
 
 lint: build  ## check the style with ruff
 	@.venv/bin/ruff check $(ARGS)

@@ -1,0 +1,115 @@
+"""make reproduce: trains what the paper's figures show and draws them again, as declared in config/figures/.
+
+    make reproduce figure='1b 4' seeds=2 steps=200000 workers=2
+    make reproduce figure=1b ARGS=--list
+
+Runs go to runs/reproduce/, results to docs/results/ and docs/results.md, also while some runs are still missing. Figures share
+the runs they have in common. Whatever interrupts it, the same command goes on from there; more steps or seeds go on from what
+there is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import dae_ros_nodes  # noqa: F401  sets the threads of the numerical libraries, as for the nodes
+
+from benchmarks.machine import ROOT
+from dae_ros.errors import DaeRosError
+from reproduce import figures, schedule
+from reproduce.figures import Figure
+from reproduce.progress import Progress
+from reproduce.records import Records
+from reproduce.results import write_results
+
+REFRESH_PERIOD = 60.0  # s between two drawings while runs are being trained
+
+
+def positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'must be at least 1, not {value}')
+    return value
+
+
+def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog='make reproduce', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('figures', nargs='*', metavar='figure', help='figures of the paper, such as 1b; all without any')
+    parser.add_argument('--seeds', type=positive, help='seeds of every curve, in place of those declared')
+    parser.add_argument('--steps', type=positive, help='environment steps of every run, in place of those declared')
+    parser.add_argument('--workers', type=positive, default=len(os.sched_getaffinity(0)),
+                        help='runs trained at a time; default: the cores there are, %(default)s')
+    parser.add_argument('--short', action='store_true', help='see everything work in a minute: the first team of each figure, '
+                                                             'few worlds and updates; give --runs and --docs with it')
+    parser.add_argument('--runs', type=Path, default=ROOT / 'runs' / 'reproduce', help='folder of the runs')
+    parser.add_argument('--docs', type=Path, default=ROOT / 'docs', help='folder of the results')
+    parser.add_argument('--list', action='store_true', help='say what there is and how much of it is done, and train nothing')
+    parsed = parser.parse_args(arguments)
+    if parsed.short and (parsed.runs == parser.get_default('runs') or parsed.docs == parser.get_default('docs')):
+        parser.error('--short needs --runs and --docs, lest its results replace the real ones')
+    return parsed
+
+
+def show(chosen: list[Figure], records: Records) -> None:
+    """A line for each figure: its runs, how many are done, and the core hours left at the speed of those done."""
+    for figure in chosen:
+        runs = figure.all_runs()
+        left = schedule.jobs(runs, records)
+        print(f'{figure.name:4} {figure.title}: {len(runs)} runs, {len(runs) - len(left)} done, '
+              f'{sum(job.run.steps - job.begins_at for job in left) / 1e6:.1f}M steps left')
+
+
+def reproduce(chosen: list[Figure], workers: int, records: Records, docs: Path) -> int:
+    """Trains what is missing and writes the results. Returns how many runs failed."""
+    drawn_at = time.monotonic()
+
+    def refresh() -> None:
+        nonlocal drawn_at
+        if time.monotonic() - drawn_at > REFRESH_PERIOD:
+            write_results(chosen, records, docs)
+            drawn_at = time.monotonic()
+
+    todo = schedule.jobs([run for figure in chosen for run in figure.all_runs()], records)
+    with Progress() as progress:
+        progress.note(f'{len(todo)} runs to train in {records.folder}')
+        try:
+            failed = schedule.train(todo, workers, records, progress, refresh)
+        finally:
+            write_results(chosen, records, docs)
+    print(f'results in {docs / "results.md"}')
+    if failed:
+        print(f'{len(failed)} runs failed: {", ".join(run.name for run in failed)}', file=sys.stderr)
+    return len(failed)
+
+
+def interrupt(number: int, frame) -> None:
+    """SIGTERM ends it the way Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = parse_arguments(arguments)
+    signal.signal(signal.SIGTERM, interrupt)
+    records = Records(options.runs)
+    try:
+        chosen = figures.load(options.figures, options.seeds, options.steps, options.short)
+        if options.list:
+            show(chosen, records)
+            return 0
+        return 1 if reproduce(chosen, options.workers, records, options.docs) else 0
+    except KeyboardInterrupt:
+        print('stopped; the same command goes on from here', file=sys.stderr)
+        return 130
+    except DaeRosError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,23 @@
+"""What is kept of the figures: docs/results/<figure>.csv and .png, and the tables in docs/results.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Iterable
+
+from reproduce.curves import Curves
+from reproduce.draw import draw
+from reproduce.figures import Figure
+from reproduce.records import Records
+from reproduce.tables import figure_block, write_block
+
+
+def write_results(figures: Iterable[Figure], records: Records, docs: Path) -> None:
+    """Writes every figure anew that has a finished run."""
+    (docs / 'results').mkdir(parents=True, exist_ok=True)
+    for figure in figures:
+        curves = Curves(figure, records)
+        if any(curves.seeds.values()):
+            curves.write_csv(docs / 'results' / f'{figure.name}.csv')
+            draw(curves, docs / 'results' / f'{figure.name}.png')
+            write_block(docs / 'results.md', figure.name, figure_block(curves, records))

@@ -1,0 +1,113 @@
+"""python -m reproduce.run FOLDER SETTINGS: one training in this process, in one thread, resumed where it was interrupted.
+
+SETTINGS is a JSON object of settings by their names. The folder is a run's folder as bringup makes it, and holds beside it
+`finished_<steps>.json`, the facts of every end it came to.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import platform
+import signal
+import sys
+from pathlib import Path
+from typing import Any, Mapping
+
+import dae_ros_nodes  # noqa: F401  sets the threads of the numerical libraries, as for the nodes
+import numpy as np
+import torch
+
+from benchmarks.machine import description
+from dae_ros import config
+from dae_ros.config import Settings
+from dae_ros.errors import DaeRosError, RunFolderError
+from dae_ros.files import write_atomically
+from dae_ros.rollout.in_process import train
+from dae_ros.run_folder import RunFolder
+from dae_ros.training import Training
+from dae_ros.worlds import make_worlds
+from reproduce.records import finished_file
+
+NICENESS = 10  # whoever works on this machine comes first
+
+
+class Stopped(Exception):
+    """The run was asked to stop before its end; its checkpoint is written."""
+
+
+def run(path: Path, settings: Settings) -> None:
+    """Trains and evaluates in the folder `path` and writes its facts.
+
+    Raises Stopped after SIGINT or SIGTERM, or when its parent is gone, and DaeRosError if the folder is another run's.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    with open(path / 'lock', 'w') as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunFolderError(f'{path} is being trained by another process') from error
+        _train(path, settings)
+
+
+def _train(path: Path, settings: Settings) -> None:
+    stopping, parent, ran_on = [], os.getppid(), description()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopping.append(True))
+    _adopt(path, settings)
+    worlds = make_worlds(settings.task)
+    training = Training(settings, worlds.spec, RunFolder(path, settings))
+
+    def on_update() -> None:
+        # Only between updates is there a state that the run can go on from with the same weights.
+        if stopping or os.getppid() != parent:
+            training.save()
+            raise Stopped
+
+    try:
+        train(training, worlds, on_update)
+        facts = {**_result(training), 'machine': ran_on, 'versions': versions(), 'settings': config.flatten(settings)}
+        write_atomically(finished_file(path, training.environment_steps), (json.dumps(facts, indent=2) + '\n').encode())
+    finally:
+        training.close()
+        worlds.close()
+
+
+def _adopt(path: Path, settings: Settings) -> None:
+    """Lets a run go on that was begun for fewer steps, or before a setting was declared that has its default here: nothing a
+    run does depends on how long it is to be."""
+    file = path / 'settings.yaml'
+    if file.exists() and _but_for_length(config.from_flat(config.load_task_file(file))) == _but_for_length(settings):
+        write_atomically(file, config.to_yaml(settings).encode())
+
+
+def _but_for_length(settings: Settings) -> Settings:
+    return config.from_flat({'total_steps': 1}, settings)
+
+
+def _result(training: Training) -> Mapping[str, Any]:
+    returns = training.evaluation
+    return {'environment_steps': training.environment_steps, 'seconds': training.seconds,
+            'steps_per_second': training.environment_steps / training.seconds,
+            'evaluation_return': float(returns.mean()) if len(returns) else None, 'evaluation_episodes': len(returns),
+            'weights_sha256': training.weights_sha256()}
+
+
+def versions() -> dict[str, str]:
+    """Of what the numbers may depend on."""
+    return {'python': platform.python_version(), 'numpy': np.__version__, 'torch': torch.__version__}
+
+
+def main() -> None:
+    os.nice(NICENESS)
+    try:
+        run(Path(sys.argv[1]), config.from_flat(json.loads(sys.argv[2])))
+    except Stopped:
+        sys.exit('stopped; it goes on from here when it is started again')
+    except DaeRosError as error:
+        sys.exit(f'error: {error}')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,48 @@
+"""Means over seeds with their 95 % intervals, bins of environment steps, and when a curve reaches a threshold."""
+
+from __future__ import annotations
+
+from typing import Sequence
+
+import numpy as np
+from scipy.stats import t as student
+
+from dae_ros.report.learning_curve import smoothed
+
+CONFIDENCE = 0.95
+
+
+def mean_and_interval(groups: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [...] over the groups' means, and half the width [...] of its 95 % interval; nan where a group has one seed only.
+
+    groups: values [seeds, ...] of each team size, with any number of seeds. With one group this is Student's interval of a
+    mean; with several, whose spreads differ, the degrees of freedom are those of Welch and Satterthwaite.
+    """
+    mean = np.mean([group.mean(0) for group in groups], axis=0)
+    if min(map(len, groups)) < 2:
+        return mean, np.full_like(mean, np.nan)
+    # Variance of each group's mean, as it enters the mean over the groups.
+    parts = np.array([group.var(0, ddof=1) / len(group) for group in groups]) / len(groups) ** 2
+    freedom = np.array([len(group) - 1 for group in groups]).reshape(-1, *[1] * mean.ndim)
+    total = parts.sum(0)
+    smallest = np.finfo(float).tiny  # seeds that agree exactly have an interval of width 0
+    effective = np.maximum(total ** 2, smallest) / np.maximum((parts ** 2 / freedom).sum(0), smallest)
+    return mean, student.ppf((1 + CONFIDENCE) / 2, effective) * np.sqrt(total)
+
+
+def binned(values: np.ndarray, width: int) -> np.ndarray:
+    """Means [rows // width] over `width` rows each; rows without a number are left out, and so is a last bin that is not full.
+
+    Fewer rows than one bin make one.
+    """
+    width = min(width, len(values))
+    rows = values[:len(values) // width * width].reshape(-1, width)
+    known = np.isfinite(rows)
+    count = known.sum(1)
+    return np.where(count > 0, np.where(known, rows, 0.0).sum(1) / np.maximum(count, 1), np.nan)
+
+
+def steps_to_reach(threshold: float, steps: np.ndarray, values: np.ndarray) -> float | None:
+    """The first of `steps` [rows] at which `values` [rows], smoothed, are at the threshold or above; None if they never are."""
+    reached = np.flatnonzero(smoothed(values) >= threshold)
+    return float(steps[reached[0]]) if len(reached) else None

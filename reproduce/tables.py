@@ -1,0 +1,190 @@
+"""The tables of docs/results.md: what is between a figure's markers is generated anew, the rest stays as it was written."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Iterable, Sequence
+
+import numpy as np
+
+from dae_ros import config
+from dae_ros.config import Settings
+from dae_ros.files import write_atomically
+from dae_ros.report.style import signed
+from reproduce.curves import Curves, Seed
+from reproduce.draw import METRIC_LABELS
+from reproduce.figures import Team
+from reproduce.records import Records
+from reproduce.statistics import mean_and_interval, steps_to_reach
+
+END_SHARE = 0.05  # of a training, over which its last return is averaged
+HEADER = '''# Results
+
+The paper's figures, trained and drawn again by `make reproduce`. Lines and numbers are means over seeds, bands and ± their 95 %
+intervals (Student's t).
+'''
+
+
+def replace_block(text: str, name: str, block: str) -> str:
+    """`text` with `block` between the markers of figure `name`, which are added at the end where there are none."""
+    begin, end = f'<!-- generated: figure {name} -->', '<!-- end -->'
+    marked = f'{begin}\n{block}\n{end}'
+    found = re.compile(f'{re.escape(begin)}.*?{re.escape(end)}', re.DOTALL)
+    if found.search(text):
+        return found.sub(lambda _: marked, text, count=1)
+    return f'{text.rstrip()}\n\n## Figure {name}\n\n{marked}\n'
+
+
+def write_block(path: Path, name: str, block: str) -> None:
+    """Puts `block` into the file, which is begun if it is not there."""
+    text = path.read_text(encoding='utf-8') if path.exists() else HEADER
+    write_atomically(path, replace_block(text, name, block).encode())
+
+
+def figure_block(curves: Curves, records: Records) -> str:
+    """All that is told of one figure: picture, tables, settings, versions and machine."""
+    figure = curves.figure
+    facts = [fact for seed in _all_seeds(curves) if (fact := records.facts(seed.run)) is not None]
+    parts = [f'**{figure.title}.** Data: [results/{figure.name}.csv](results/{figure.name}.csv).',
+             f'![{figure.title}](results/{figure.name}.png)', _results(curves, records)]
+    if figure.baseline:
+        parts.append(_differences(curves))
+    parts.append('\n'.join([*_settings(curves), *_origins(facts)]))
+    return '\n\n'.join(part for part in parts if part)
+
+
+def _groups(curves: Curves) -> Iterable[tuple[str, list[Team]]]:
+    """A task and the teams that share a row."""
+    for task in curves.figure.tasks:
+        if curves.figure.average:
+            yield task, curves.averaged(task)
+        else:
+            yield from ((task, [team]) for team in curves.figure.sizes(task))
+
+
+def _all_seeds(curves: Curves) -> list[Seed]:
+    longer = (seed for seed in curves.longer.values() if seed is not None)
+    return [*(seed for seeds in curves.seeds.values() for seed in seeds), *longer]
+
+
+def _results(curves: Curves, records: Records) -> str:
+    figure, rows = curves.figure, []
+    head = ['task', 'N', 'curve', 'seeds', 'steps', f'{METRIC_LABELS[figure.shows]}, last 5 %', 'greedy, at the end']
+    if figure.threshold is not None:
+        head.append(f'steps to {figure.threshold:g}')
+    for task, teams in _groups(curves):
+        reached = {}
+        for curve in figure.curves:
+            band = curves.band(teams, curve, figure.shows)
+            if band is None:
+                continue
+            groups = [curves.seeds[team, curve] for team in teams]
+            cells = [task, _sizes(teams), curve, _counts(curves, teams, curve), f'{groups[0][0].run.steps:,}',
+                     _number(*_interval(groups, lambda seed: last(seed.metrics[figure.shows]))),
+                     _number(*_interval(groups, lambda seed: _evaluation(seed, records)))]
+            if figure.threshold is not None:
+                reached[curve] = steps_to_reach(figure.threshold, band.steps, band.mean)
+                cells.append(_reached(reached.get(figure.baseline), reached[curve], band.steps[-1]))
+            rows.append(cells)
+            longer = curves.longer[teams[0], curve] if len(teams) == 1 else None
+            if longer is not None:
+                cells = [task, _sizes(teams), curve, f'seed {longer.run.seed} alone', f'{longer.run.steps:,}',
+                         _number(last(longer.metrics[figure.shows]), np.nan), _number(_evaluation(longer, records), np.nan)]
+                if figure.threshold is not None:
+                    cells.append('')
+                rows.append(cells)
+    return _table(head, rows)
+
+
+def _differences(curves: Curves) -> str:
+    """Every curve minus the baseline, seed by seed, at the end of training."""
+    figure, rows = curves.figure, []
+    for task, teams in _groups(curves):
+        for curve in figure.curves:
+            pairs = [_pairs(curves, team, curve) for team in teams]
+            if curve != figure.baseline and pairs and all(map(len, pairs)):
+                rows.append([task, _sizes(teams), f'{curve} − {figure.baseline}', ' + '.join(str(len(pair)) for pair in pairs),
+                             _number(*mean_and_interval(pairs))])
+    return rows and _table(['task', 'N', 'difference, paired by seed', 'pairs', f'{METRIC_LABELS[figure.shows]}, last 5 %'], rows)
+
+
+def _pairs(curves: Curves, team: Team, curve: str) -> np.ndarray:
+    """Differences [seeds] of the curve and the baseline for the seeds that both have."""
+    ours, theirs = ({seed.run.seed: last(seed.metrics[curves.figure.shows]) for seed in curves.seeds[team, name]}
+                    for name in (curve, curves.figure.baseline))
+    return np.array([ours[seed] - theirs[seed] for seed in ours if seed in theirs])
+
+
+def last(values: np.ndarray) -> float:
+    """Mean over the last part of a training."""
+    return float(np.mean(values[-max(1, round(END_SHARE * len(values))):]))
+
+
+def _interval(groups: Sequence[Sequence[Seed]], value) -> tuple[float, float]:
+    return mean_and_interval([np.array([value(seed) for seed in group]) for group in groups])
+
+
+def _evaluation(seed: Seed, records: Records) -> float:
+    facts = records.facts(seed.run)
+    found = None if facts is None else facts['evaluation_return']
+    return np.nan if found is None else found
+
+
+def _reached(baseline: float | None, steps: float | None, end: float) -> str:
+    if steps is None:
+        return f'not within {end:,.0f}'
+    share = f' ({baseline / steps:.1f} times as fast as the baseline)' if baseline and baseline != steps else ''
+    return f'{steps:,.0f}{share}'
+
+
+def _counts(curves: Curves, teams: list[Team], curve: str) -> str:
+    return ' + '.join(f'{count}' if count == team.seeds else f'{count} of {team.seeds}'
+                      for count, team in zip(curves.counts(teams, curve), teams))
+
+
+def _sizes(teams: Sequence[Team]) -> str:
+    return ', '.join(str(team.num_agents) for team in teams)
+
+
+def _number(mean: float, half: float) -> str:
+    """`mean ± half` with two digits behind the point where the numbers are small, one otherwise."""
+    if not np.isfinite(mean):
+        return ''
+    digits = 1 if abs(mean) >= 20 else 2
+    return signed(mean, digits) + (f' ± {half:.{digits}f}' if np.isfinite(half) else '')
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ['---'] * len(head), *rows]
+    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+
+
+def _settings(curves: Curves) -> list[str]:
+    """What differs from the defaults, for each task, and for each curve."""
+    figure, lines = curves.figure, []
+    for task in figure.tasks:
+        common = _changed(figure.run(figure.sizes(task)[0], figure.baseline or next(iter(figure.curves)), 1).settings)
+        for name in ('task', 'num_agents', 'seed', 'total_steps', *(name for curve in figure.curves.values() for name in curve)):
+            common.pop(name, None)
+        lines.append(f'- Settings of {task} (`config/{task}.yaml`) other than the defaults: {_listed(common) or "none"}.')
+    told = '; '.join(f'{curve}: {_listed(changes)}' for curve, changes in figure.curves.items())
+    return [*lines, f'- Curves: {told}.']
+
+
+def _changed(settings: Settings) -> dict[str, Any]:
+    return {name: value for name, value in config.flatten(settings).items() if value != config.SETTINGS[name].default}
+
+
+def _listed(values) -> str:
+    return ', '.join(f'`{name}` {value}' for name, value in values.items())
+
+
+def _origins(facts: Sequence[dict[str, Any]]) -> list[str]:
+    """Where the numbers come from: every machine, version and commit that took part."""
+    machines = {'{processor}, {cores} cores, {system}'.format(**fact['machine']) for fact in facts}
+    versions = {', '.join(f'{name} {version}' for name, version in fact['versions'].items()) for fact in facts}
+    commits = {fact['machine']['commit'] for fact in facts}
+    hours = sum(fact['seconds'] for fact in facts) / 3600
+    return [f'- {len(facts)} runs, {hours:.1f} hours of one core altogether, on {"; ".join(sorted(machines))}.',
+            f'- Versions: {"; ".join(sorted(versions))}. Commit: {", ".join(sorted(commits))}.']
