@@ -172,7 +172,7 @@ def _mapping(value: Any, origin: str) -> dict[Any, Any]:
 
 
 def _fields(values: dict[Any, Any], origin: str, needed: Mapping[str, type], optional: Mapping[str, type] = {}) -> dict[str, Any]:
-    """`values`, None for what is optional and missing. Raises SettingsError for a key that is unknown, missing or of another type."""
+    """`values`, None for what is optional and missing. Raises SettingsError for a key unknown, missing or of another type."""
     kinds = {**needed, **optional}
     for name, value in values.items():
         if name not in kinds:
