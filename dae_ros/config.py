@@ -42,6 +42,8 @@ class TaskSettings:
     episode_steps: int = setting(0, 'steps after which an episode ends; 0 takes the task\'s own (25 in the particle tasks, '
                                     'N in the matrix game)', unit='steps', minimum=0, maximum=1_000_000)
     observe_others: bool = setting(False, 'formation and line: each robot also observes the other robots\' relative positions')
+    reward_delay: int = setting(0, 'steps after which a reward is paid; what is still owed at an episode\'s end is paid with its '
+                                   'last step. Built-in tasks only', unit='steps', minimum=0, maximum=1_000_000)
 
     def __post_init__(self):
         if self.num_worlds % self.world_groups:
@@ -56,21 +58,31 @@ class TaskSettings:
 
 @dataclass(frozen=True)
 class RewardNetworkSettings:
-    """The learnt reward behind the credit (paper section 3.3). Unused at beta = 0."""
+    """The learnt reward behind the credit (paper section 3.3), unused at beta = 0; with COMA its action values instead."""
 
     architecture: str = setting('per_agent', 'the paper\'s network, recurrent for each agent, or one recurrent pass per world '
                                              'with a small head per agent', choices=('per_agent', 'shared_trunk'))
     hidden_size: int = setting(128, 'width of the reward network', unit='units', minimum=1, maximum=4096)
     trunk_size: int = setting(96, 'width of the recurrent layer of shared_trunk', unit='units', minimum=1, maximum=4096)
+    recurrent: bool = setting(True, 'the reward network remembers earlier steps of the episode, which delayed rewards depend on')
     ensemble_size: int = setting(1, 'networks averaged: 1 as in the paper, 2 as in its authors\' code', minimum=1, maximum=16)
     learning_rate: float = setting(7e-4, 'step size of the reward network\'s Adam', minimum=0.0, maximum=1.0)
     epochs: int = setting(10, 'passes over a rollout per update', minimum=1, maximum=1000)
+    replay_rollouts: int = setting(0, 'newest rollouts the reward network learns from, by replay_steps steps per update instead '
+                                      'of epochs; 0 takes the last alone. They are part of every checkpoint',
+                                   unit='rollouts', minimum=0, maximum=100_000)
+    replay_steps: int = setting(40, 'gradient steps per update on replayed rollouts', unit='steps', minimum=1, maximum=100_000)
+    replay_chunks: int = setting(64, 'chunks drawn for each of these steps', unit='chunks', minimum=1, maximum=1_000_000)
 
 
 @dataclass(frozen=True)
 class LearnerSettings:
     """Recurrent MAPPO with DAE. Only the trainer needs it. Defaults: the paper's appendix C and its authors' code."""
 
+    estimator: str = setting('dae', 'advantages: DAE (at beta 0 GAE, which is plain MAPPO), the counterfactual ones of COMA, or '
+                                    'those with the first rewards as they were', choices=('dae', 'coma', 'coma_nstep'))
+    coma_steps: int = setting(5, 'rewards that stand for the action value in coma_nstep (n of eq. 41)', unit='steps', minimum=1,
+                              maximum=1000)
     beta: float = setting(0.95, 'credit against bias: 0 is GAE (plain MAPPO), 1 difference rewards', minimum=0.0, maximum=1.0)
     gamma: float = setting(0.99, 'discount per step', minimum=0.0, maximum=1.0)
     gae_lambda: float = setting(0.95, 'bias against variance of the advantages (lambda of GAE)', minimum=0.0, maximum=1.0)

@@ -124,6 +124,10 @@ class Training:
         self._folder.save_checkpoint(self._updates, self._learner.state(), facts)
         write_atomically(self._folder.policy_file, encode_policy(self.policy))
 
+    def expected_rewards(self, trajectory: Trajectory) -> np.ndarray:
+        """As `Learner.expected_rewards`."""
+        return self._learner.expected_rewards(trajectory)
+
     def weights_sha256(self) -> str:
         """SHA-256 of everything learnt: all networks, their optimisers' moments, the value normaliser."""
         return tensors_sha256(self._learner.state())

@@ -1,7 +1,7 @@
 """python -m reproduce.run FOLDER SETTINGS: one training in this process, in one thread, resumed where it was interrupted.
 
 SETTINGS is a JSON object of settings by their names. The folder is a run's folder as bringup makes it, and holds beside it
-`finished_<steps>.json`, the facts of every end it came to.
+`finished_<steps>.json`, the facts of every end it came to, and credit/metrics.csv, how well its reward network tells credit.
 """
 
 from __future__ import annotations
@@ -23,15 +23,19 @@ import torch
 from benchmarks.machine import description
 from dae_ros import config
 from dae_ros.config import Settings
+from dae_ros.credit_probe import accuracy, probe
 from dae_ros.errors import DaeRosError, RunFolderError
 from dae_ros.files import write_atomically
+from dae_ros.report.metrics import MetricsLog
 from dae_ros.rollout.in_process import train
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
 from dae_ros.worlds import make_worlds
+from dae_ros.worlds.synchronous import SynchronousWorlds
 from reproduce.records import finished_file
 
 NICENESS = 10  # whoever works on this machine comes first
+PROBE_INTERVAL = 50_000  # environment steps between two measurements of the credit
 
 
 class Stopped(Exception):
@@ -57,8 +61,12 @@ def _train(path: Path, settings: Settings, stopping: Callable[[], bool]) -> None
     _adopt(path, settings)
     worlds = make_worlds(settings.task)
     training = Training(settings, worlds.spec, RunFolder(path, settings))
+    learns_reward = settings.learner.estimator == 'dae' and settings.learner.beta > 0
+    credit = CreditLog(path / 'credit', training, worlds) if learns_reward else None
 
     def on_update() -> None:
+        if credit is not None:
+            credit.on_update()
         # Only between updates is there a state that the run can go on from with the same weights.
         if stopping():
             training.save()
@@ -71,6 +79,31 @@ def _train(path: Path, settings: Settings, stopping: Callable[[], bool]) -> None
     finally:
         training.close()
         worlds.close()
+        if credit is not None:
+            credit.close()
+
+
+class CreditLog:
+    """Measures every PROBE_INTERVAL steps how well the reward network tells credit, on rollouts that leave no trace."""
+
+    def __init__(self, folder: Path, training: Training, worlds: SynchronousWorlds):
+        self._training = training
+        self._worlds = worlds
+        self._log = MetricsLog(folder, training.environment_steps or None)
+        self._probed_at = training.environment_steps
+
+    def on_update(self) -> None:
+        """Measures if it is time to, or the training is over."""
+        training, run = self._training, self._training.settings.run
+        steps = training.environment_steps
+        if steps == self._probed_at or (steps // PROBE_INTERVAL == self._probed_at // PROBE_INTERVAL and not training.evaluating):
+            return
+        found = probe(self._worlds, training.policy, training.expected_rewards, run.seed, training.policy_version, run.num_steps)
+        self._log.write(steps, accuracy(found.trajectory.rewards, found.expected, found.predicted)._asdict())
+        self._probed_at = steps
+
+    def close(self) -> None:
+        self._log.close()
 
 
 def _adopt(path: Path, settings: Settings) -> None:

@@ -4,10 +4,10 @@ import copy
 import functools
 import math
 import os
-import shlex
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
 
@@ -16,7 +16,7 @@ import torch
 
 from dae_ros.config import RewardNetworkSettings
 from dae_ros.learning import kernels, losses, networks
-from dae_ros.learning.native import build
+from dae_ros.learning.native import build, library
 from dae_ros.types import WorldSpec
 
 native = pytest.mark.skipif(not kernels.available(), reason='the kernels cannot be compiled here, or are off')
@@ -511,22 +511,10 @@ def odd_shapes():
     yield from examples()
 
 
-@pytest.fixture(scope='module')
-def compiled(tmp_path_factory):
-    """Compiles the kernels with more flags, once each; gives the library's path."""
-    @functools.lru_cache(maxsize=None)
-    def compiled_with(*flags):
-        path = tmp_path_factory.mktemp('kernels') / 'kernels.so'
-        build.build(path, *flags)
-        return path
-
-    return compiled_with
-
-
 @native
 @pytest.mark.parametrize('lanes', [8, 16])
 def test_vectors_of_either_width_compute_the_same(lanes, compiled, monkeypatch):
-    monkeypatch.setattr(kernels, 'library', kernels.opened(compiled(f'-DLANES={lanes}', '-O1')))
+    monkeypatch.setattr(kernels, 'library', library.opened(compiled(f'-DLANES={lanes}', '-O1')))
     for case in odd_shapes():
         assert_exact_to_rounding(*case)
 
@@ -535,12 +523,16 @@ SANITIZERS = '-fsanitize=address,undefined', '-fno-sanitize-recover=all', '-O0',
 RUN_ODD_SHAPES = """
 import runpy, sys
 from dae_ros.learning import kernels
-kernels.library = kernels.opened(sys.argv[1])
-tests = runpy.run_path(sys.argv[2])
+from dae_ros.learning.native import library
+kernels.library = library.opened(sys.argv[1])
+library.chosen = lambda: kernels.library
+tests, tests_of_policy = map(runpy.run_path, sys.argv[2:])
 for network, batch, loss in tests['odd_shapes']():
     tests['results'](network, batch, loss)
     for laid_out in tests['LAYOUTS'].values():
         tests['results'](network, tests['changed'](batch, laid_out), tests['changed'](loss, laid_out))
+for architecture in tests_of_policy['ODD_SIZES']:
+    tests_of_policy['act_in_both'](architecture, 50)
 """
 
 
@@ -548,63 +540,16 @@ for network, batch, loss in tests['odd_shapes']():
 @pytest.mark.slow  # compiles, and Python under the sanitizer
 def test_nothing_is_read_or_written_beyond_its_end(compiled):
     try:
-        library = compiled(*SANITIZERS)
+        path = compiled(*SANITIZERS)
     except build.BuildError as error:
         pytest.skip(f'the compiler has no sanitizers: {error}')
     # The sanitizer watches memory from the first allocation of a process on, so the process must begin with it.
-    linked = subprocess.run(['ldd', library], capture_output=True, text=True, timeout=60).stdout.split()
+    linked = subprocess.run(['ldd', path], capture_output=True, text=True, timeout=60).stdout.split()
     sanitizer = [word for word in linked if word.startswith('/') and 'asan' in word]
     if not sanitizer:
         pytest.skip('the sanitizer is no library of its own here')
     environment = os.environ | {'LD_PRELOAD': sanitizer[0], 'ASAN_OPTIONS': 'detect_leaks=0', 'DAE_ROS_KERNELS': 'torch'}
-    result = subprocess.run([sys.executable, '-c', RUN_ODD_SHAPES, library, __file__], env=environment, capture_output=True,
-                            text=True, timeout=300)
+    tests_of_policy = Path(__file__).with_name('test_policy.py')
+    result = subprocess.run([sys.executable, '-c', RUN_ODD_SHAPES, path, __file__, tests_of_policy], env=environment,
+                            capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
-
-
-ASK = 'import torch; from dae_ros.learning import kernels; print(kernels.available())'
-BUILD = 'import ctypes; from dae_ros.learning.native.build import library_path\nwith library_path() as p: ctypes.CDLL(str(p))'
-
-
-def answer(code=ASK, **environment):
-    """What a fresh process says about the kernels, and what it warns of."""
-    result = subprocess.run([sys.executable, '-c', code], env=os.environ | environment, capture_output=True, text=True,
-                            timeout=180)
-    return result.stdout.strip(), result.stderr
-
-
-@pytest.fixture
-def quick_compiler(tmp_path):
-    """A C compiler that does not optimise."""
-    path = tmp_path / 'cc'
-    path.write_text(f'#!/bin/sh\nexec {shlex.join(build._compiler())} "$@" -O0\n')
-    path.chmod(0o755)
-    return str(path)
-
-
-def test_kernels_can_be_switched_off():
-    with ThreadPoolExecutor(2) as pool:
-        off, unknown = pool.map(lambda choice: answer(DAE_ROS_KERNELS=choice), ('torch', 'fast'))
-    assert off == ('False', '')
-    assert 'must be native or torch' in unknown[1]
-
-
-def test_without_a_compiler_torch_takes_over_with_one_warning(tmp_path):
-    available, warnings = answer(DAE_ROS_KERNELS='native', CC='no-such-compiler', XDG_CACHE_HOME=str(tmp_path))
-    assert available == 'False'
-    assert warnings.count('several times slower') == 1 and 'no C compiler' in warnings
-
-
-@native
-def test_processes_that_start_at_once_all_get_whole_kernels(tmp_path, quick_compiler):
-    with ThreadPoolExecutor(3) as pool:
-        answers = list(pool.map(lambda _: answer(BUILD, XDG_CACHE_HOME=str(tmp_path), CC=quick_compiler), range(3)))
-    assert answers == [('', '')] * 3
-    assert len(list((tmp_path / 'dae_ros').iterdir())) == 1
-    assert answer(DAE_ROS_KERNELS='native', XDG_CACHE_HOME=str(tmp_path), CC=quick_compiler) == ('True', '')
-
-
-@native
-def test_kernels_are_built_even_where_no_cache_can_be_kept(tmp_path, quick_compiler):
-    (tmp_path / 'file').touch()
-    assert answer(DAE_ROS_KERNELS='native', XDG_CACHE_HOME=str(tmp_path / 'file'), CC=quick_compiler) == ('True', '')

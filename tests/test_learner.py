@@ -19,6 +19,8 @@ SPEC = WorldSpec(num_agents=3, num_actions=4, observation_size=5, state_size=7, 
 LEARNER = LearnerSettings(hidden_size=8, epochs=2, beta=0.9, learner_threads=1)
 REWARD = RewardNetworkSettings(hidden_size=12, trunk_size=10, epochs=2)
 SHARED_TRUNK = replace(REWARD, architecture='shared_trunk')
+COMA = replace(LEARNER, estimator='coma')
+REPLAY = replace(REWARD, replay_rollouts=2, replay_steps=5, replay_chunks=3)
 REWARDS = pytest.mark.parametrize('reward_settings', [REWARD, SHARED_TRUNK], ids=['per agent', 'shared trunk'])
 
 # Adam's first step is learning_rate * g / (|g| + epsilon): with an epsilon of 1 the weights show the gradient itself.
@@ -322,8 +324,9 @@ def test_the_same_seed_learns_the_same_and_another_seed_something_else(reward_se
 
 @pytest.mark.parametrize('settings, reward_settings', [
     (LEARNER, REWARD), (replace(LEARNER, beta=0.0), REWARD), (replace(LEARNER, num_mini_batches=2), REWARD),
-    (LEARNER, replace(REWARD, ensemble_size=2)), (LEARNER, SHARED_TRUNK)],
-    ids=['beta 0.9', 'beta 0', 'mini-batches', 'ensemble', 'shared trunk'])
+    (LEARNER, replace(REWARD, ensemble_size=2)), (LEARNER, SHARED_TRUNK), (COMA, REWARD),
+    (replace(LEARNER, estimator='coma_nstep'), SHARED_TRUNK), (LEARNER, replace(REPLAY, ensemble_size=2))],
+    ids=['beta 0.9', 'beta 0', 'mini-batches', 'ensemble', 'shared trunk', 'coma', 'coma n-step', 'replay'])
 def test_a_learner_goes_on_from_a_checkpoint_bit_for_bit(settings, reward_settings, make_learner):
     one, other = make_learner(settings, reward_settings), make_learner(settings, reward_settings, seed=1)
     updated(one, range(3))

@@ -1,6 +1,8 @@
 """The policy robots act with: the same network as the learner's actor, and draws keyed by what they are for."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -9,13 +11,31 @@ from hypothesis import given, settings, strategies
 
 from dae_ros import draws
 from dae_ros.config import LearnerSettings
+from dae_ros.learning.native import library
 from dae_ros.learning.networks import make_actor
 from dae_ros.learning.policy import Policy, PolicyArchitecture, choose
 from dae_ros.types import WorldSpec
 
+native = pytest.mark.skipif(library.chosen() is None, reason='the library cannot be compiled here, or is off')
+
 SIZES = PolicyArchitecture(observation_size=7, num_actions=5, hidden_size=16, mlp_layers=2, activation='relu')
 ARCHITECTURES = [SIZES, SIZES._replace(activation='tanh'), SIZES._replace(mlp_layers=3, num_actions=2),
                  SIZES._replace(mlp_layers=1, hidden_size=5, observation_size=3)]
+# None a multiple of the vectors' width or within one panel of the products, and the smallest there is.
+ODD_SIZES = [PolicyArchitecture(*sizes, layers, activation) for sizes in ((18, 5, 33), (35, 17, 70), (1, 1, 1))
+             for layers in (1, 2, 3) for activation in ('relu', 'tanh')]
+
+
+@pytest.fixture(scope='module', params=[pytest.param('native', marks=native), 'numpy'])
+def either_way(request):
+    """The test runs with the compiled policy and with that in numpy."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == 'numpy':
+            patch.setattr(library, 'chosen', lambda: None)
+        yield
+
+
+EITHER_WAY = pytest.mark.usefixtures('either_way')
 
 
 def actor_of(architecture, seed=1):
@@ -34,6 +54,27 @@ def policy_of(actor, architecture):
     return Policy(architecture, {name: parameter.detach().numpy() for name, parameter in actor.named_parameters()})
 
 
+def random_policy(architecture, seed=1):
+    """A policy of which every bias and scale counts."""
+    random = np.random.default_rng(seed)
+    return Policy(architecture, {name: random.normal(0, 0.5, shape).astype(np.float32)
+                                 for name, shape in architecture.shapes().items()})
+
+
+def in_numpy(policy):
+    """The same policy without the compiled library."""
+    with mock.patch.object(library, 'chosen', lambda: None):
+        return Policy(policy.architecture, policy.tensors)
+
+
+def act_in_both(architecture, worlds):
+    """What six steps give compiled, and in numpy."""
+    policy = random_policy(architecture)
+    values, episode_start = observations(6, worlds, architecture)
+    initial = np.random.default_rng(2).uniform(-1, 1, (worlds, architecture.hidden_size)).astype(np.float32)
+    return [act_through(one, values, episode_start, initial) for one in (policy, in_numpy(policy))]
+
+
 def observations(steps, worlds, architecture, seed=1):
     """Values [T, W, O] float32 and episode starts [T, W], some of them in the middle and not all at the first step."""
     random = np.random.default_rng(seed)
@@ -50,6 +91,7 @@ def act_through(policy, values, episode_start, state):
     return np.stack(probabilities), np.stack(states)
 
 
+@EITHER_WAY
 @pytest.mark.parametrize('architecture', ARCHITECTURES, ids=str)
 def test_robots_act_with_the_network_the_learner_trains(architecture):
     actor = actor_of(architecture)
@@ -70,6 +112,53 @@ def test_the_tensors_of_a_policy_are_those_of_the_actor_in_the_order_of_the_forw
     assert list(SIZES.shapes())[0] == 'input_norm.weight' and list(SIZES.shapes())[-1] == 'head.bias'
 
 
+def assert_equal_to_rounding(architecture):
+    # The deviation of a single unit is 0, and a LayerNorm divides rounding by little more than that.
+    tolerance = 1e-2 if architecture.hidden_size == 1 else 1e-4
+    for compiled, plain in zip(*act_in_both(architecture, 50)):
+        assert compiled.dtype == plain.dtype == np.float32
+        np.testing.assert_allclose(compiled, plain, rtol=tolerance, atol=tolerance / 10)
+
+
+@native
+@pytest.mark.parametrize('architecture', ODD_SIZES, ids=str)
+def test_the_compiled_policy_equals_that_in_numpy_to_rounding(architecture):
+    assert_equal_to_rounding(architecture)
+
+
+@native
+@pytest.mark.parametrize('lanes', [8, 16])
+def test_vectors_of_either_width_act_the_same(lanes, compiled, monkeypatch):
+    opened = library.opened(compiled(f'-DLANES={lanes}', '-O1'))
+    monkeypatch.setattr(library, 'chosen', lambda: opened)
+    for architecture in ODD_SIZES:
+        assert_equal_to_rounding(architecture)
+
+
+@EITHER_WAY
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('scale', [1e30, 1e6, 1e-6, 1e-30, 0])
+def test_huge_and_tiny_weights_saturate_cleanly(scale):
+    policy = random_policy(SIZES)
+    extreme = Policy(SIZES, {name: np.float32(scale) * tensor if name.startswith(('gru.', 'head.')) else tensor
+                             for name, tensor in policy.tensors.items()})
+    values, episode_start = observations(4, 20, SIZES)
+    probabilities, states = act_through(extreme, values, episode_start, policy.initial_state(20))
+    assert np.isfinite(states).all() and (np.abs(states) <= 1).all()
+    np.testing.assert_allclose(probabilities.sum(-1), 1, atol=1e-5)
+
+
+@EITHER_WAY
+def test_a_nan_stays_visible_and_only_in_its_world():
+    policy = random_policy(SIZES)
+    values = observations(1, 60, SIZES)[0][0]
+    values[17, 3] = np.nan
+    found = policy.act(values, policy.initial_state(60), np.zeros(60, bool))
+    for part in found:
+        assert np.isnan(part).any(axis=1).nonzero()[0].tolist() == [17]
+
+
+@EITHER_WAY
 @pytest.mark.parametrize('architecture', ARCHITECTURES, ids=str)
 def test_probabilities_are_positive_and_sum_to_1(architecture):
     values, episode_start = observations(4, 200, architecture)
@@ -79,6 +168,7 @@ def test_probabilities_are_positive_and_sum_to_1(architecture):
     np.testing.assert_allclose(probabilities.sum(-1, dtype=np.float64), 1, atol=1e-6)
 
 
+@EITHER_WAY
 def test_the_state_is_forgotten_where_an_episode_starts_and_only_there():
     policy = policy_of(actor_of(SIZES), SIZES)
     values = observations(1, 4, SIZES)[0][0]
@@ -90,6 +180,7 @@ def test_the_state_is_forgotten_where_an_episode_starts_and_only_there():
     assert (np.abs(mixed[1::2] - fresh[1::2]).max(axis=1) > 1e-3).all()
 
 
+@EITHER_WAY
 def test_acting_leaves_the_observation_and_the_state_as_they_were():
     policy = policy_of(actor_of(SIZES), SIZES)
     values, episode_start = (part[0] for part in observations(1, 6, SIZES))
@@ -104,17 +195,81 @@ def test_acting_leaves_the_observation_and_the_state_as_they_were():
         np.testing.assert_array_equal(one, other)
 
 
+def parts_of_batches(policy, worlds, seed, others):
+    """Pairs: what worlds give among `others` of the batch, given as index arrays, and in the whole batch."""
+    values, episode_start = observations(1, worlds, policy.architecture, seed)
+    state = np.random.default_rng(seed).uniform(-1, 1, (worlds, policy.architecture.hidden_size)).astype(np.float32)
+    together = policy.act(values[0], state, episode_start[0])
+    for chosen in others:
+        for part, whole in zip(policy.act(values[0, chosen], state[chosen], episode_start[0, chosen]), together):
+            yield part, whole[chosen]
+
+
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(worlds=strategies.integers(1, 40), seed=strategies.integers(0, 1000))
-def test_a_world_gets_the_same_probabilities_in_whatever_batch_it_is(worlds, seed):
-    policy = policy_of(actor_of(SIZES), SIZES)
-    values, episode_start = observations(1, worlds, SIZES, seed)
-    state = np.random.default_rng(seed).uniform(-1, 1, (worlds, SIZES.hidden_size)).astype(np.float32)
-    together = policy.act(values[0], state, episode_start[0])
-    for world in range(worlds):
-        alone = policy.act(values[0, world:world + 1], state[world:world + 1], episode_start[0, world:world + 1])
-        for one, all_of_them in zip(alone, together):
-            np.testing.assert_allclose(one[0], all_of_them[world], rtol=1e-5, atol=1e-6)
+def test_in_numpy_a_world_gets_the_same_probabilities_to_rounding_in_whatever_batch_it_is(worlds, seed):
+    for part, whole in parts_of_batches(in_numpy(random_policy(SIZES)), worlds, seed, [[world] for world in range(worlds)]):
+        np.testing.assert_allclose(part, whole, rtol=1e-5, atol=1e-6)
+
+
+COMPILED = [random_policy(architecture) for architecture in [SIZES, *ODD_SIZES]]
+
+
+@native
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(policy=strategies.sampled_from(COMPILED), worlds=strategies.integers(1, 130), seed=strategies.integers(0, 1000),
+       data=strategies.data())
+def test_compiled_a_world_gets_the_same_bits_in_whatever_batch_it_is(policy, worlds, seed, data):
+    among = data.draw(strategies.lists(strategies.integers(0, worlds - 1), min_size=1, max_size=130))
+    for part, whole in parts_of_batches(policy, worlds, seed, [among, among[:1]]):
+        assert part.tobytes() == whole.tobytes()
+
+
+@native
+def test_several_threads_act_with_one_policy_at_once_and_get_the_same_bits():
+    policy = random_policy(SIZES._replace(hidden_size=64))
+    values, episode_start = observations(3, 100, SIZES)
+    expected = act_through(policy, values, episode_start, policy.initial_state(100))
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(lambda _: act_through(policy, values, episode_start, policy.initial_state(100)), range(40)):
+            assert [part.tobytes() for part in found] == [part.tobytes() for part in expected]
+
+
+@EITHER_WAY
+def test_a_policy_stays_as_it_was_made_whatever_becomes_of_the_tensors():
+    tensors = {name: tensor.copy() for name, tensor in random_policy(SIZES).tensors.items()}
+    policy = Policy(SIZES, tensors)
+    arguments = observations(1, 3, SIZES)[0][0], policy.initial_state(3), np.zeros(3, bool)
+    before = policy.act(*arguments)
+    for tensor in tensors.values():
+        tensor[...] = np.nan
+    for one, other in zip(policy.act(*arguments), before):
+        np.testing.assert_array_equal(one, other)
+
+
+@EITHER_WAY
+def test_observations_in_any_layout_and_no_worlds_at_all_are_taken():
+    policy = random_policy(SIZES)
+    values, episode_start = (part[0] for part in observations(1, 9, SIZES))
+    state = np.ones((9, SIZES.hidden_size), np.float32)
+    expected = policy.act(values, state, episode_start)
+    wide = np.repeat(values, 2, axis=1)[:, ::2], np.asfortranarray(state), np.repeat(episode_start, 2)[::2]
+    for one, other in zip(policy.act(*wide), expected):
+        np.testing.assert_array_equal(one, other)
+    assert [part.shape for part in policy.act(values[:0], state[:0], episode_start[:0])] == [(0, 5), (0, 16)]
+
+
+@EITHER_WAY
+@pytest.mark.parametrize('spoil', [
+    lambda x: x[:-1], lambda x: x[None], lambda x: x.astype(np.float64), lambda x: x.astype(np.int8), lambda x: x[0],
+    lambda x: x.reshape(-1, 1)], ids=['too few', 'an axis more', 'float64', 'int8', 'an axis less', 'a column'])
+@pytest.mark.parametrize('place', range(3), ids=['observations', 'state', 'episode starts'])
+def test_arguments_of_another_shape_or_type_are_refused(place, spoil):
+    policy = random_policy(SIZES)
+    arguments = [np.zeros((4, 7), np.float32), policy.initial_state(4), np.zeros(4, bool)]
+    arguments[place] = spoil(arguments[place])
+    with pytest.raises(ValueError, match='observations, state and episode starts are .* where .* needed'):
+        policy.act(*arguments)
 
 
 def spoiled(change):

@@ -29,7 +29,7 @@ from reproduce.statistics import binned, mean_and_interval, steps_to_reach
 from reproduce.tables import figure_block, replace_block
 
 ROOT = Path(__file__).parent.parent
-NEEDS_COMA = pytest.mark.skipif('estimator' not in config.SETTINGS, reason='there is no COMA yet')
+NAMES = ['1b', '2', '4', '5', '7']
 TINY = {'task': 'matrix_game', 'num_agents': 2, 'num_worlds': 2, 'num_steps': 2, 'hidden_size': 8, 'evaluation_episodes': 4,
         'checkpoint_interval': 2, **figures.EVERY_RUN}
 DECLARED = '''
@@ -64,7 +64,7 @@ def reproduce(folder, *arguments):
 
 # Declarations.
 
-@pytest.mark.parametrize('name', ['1b', '4', *(pytest.param(name, marks=NEEDS_COMA) for name in ('2', '5', '7'))])
+@pytest.mark.parametrize('name', NAMES)
 def test_every_run_of_every_figure_has_settings(name):
     figure, = figures.load([name])
     runs = figure.all_runs()
@@ -327,11 +327,10 @@ def test_csv_rows_are_few_and_the_longer_run_is_in_them_once(tmp_path):
 
 @pytest.mark.slow  # a process for each of ten runs
 def test_every_figure_is_trained_drawn_and_tabled_in_its_short_mode(tmp_path):
-    names = ['1b', '2', '4', '5', '7'] if 'estimator' in config.SETTINGS else ['1b', '4']
-    done = subprocess.run(reproduce(tmp_path, *names), cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(reproduce(tmp_path), cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     text = (tmp_path / 'docs/results.md').read_text()
-    for figure in figures.load(names, short=True):
+    for figure in figures.load(NAMES, short=True):
         assert f'<!-- generated: figure {figure.name} -->' in text
         assert (tmp_path / f'docs/results/{figure.name}.png').read_bytes().startswith(b'\x89PNG')
         rows = list(csv.DictReader(open(tmp_path / f'docs/results/{figure.name}.csv', encoding='utf-8')))

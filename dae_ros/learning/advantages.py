@@ -32,6 +32,36 @@ def expected_rewards(predicted: Tensor, probabilities: Tensor) -> Tensor:
     return (predicted * probabilities).sum(-1)
 
 
+def of_actions(numbers: Tensor, actions: Tensor) -> Tensor:
+    """Of numbers [..., A] for every action those of the actions taken [...]."""
+    return numbers.gather(-1, actions.unsqueeze(-1)).squeeze(-1)
+
+
+def lambda_returns(rewards: Tensor, values: Tensor, continues: Tensor, cut_off: Tensor, gamma: float,
+                   gae_lambda: float) -> Tensor:
+    """TD(lambda) targets of the value Q of the actions taken: y_t = r_t + gamma c_t ((1 - lambda) Q_{t+1} + lambda y_{t+1}).
+
+    All tensors [T, W]. Where `cut_off` says that the next joint action is unknown, y_t = Q_t.
+    """
+    later = torch.cat([values[1:], torch.zeros_like(values[:1])])
+    terms = torch.where(cut_off, values, rewards + gamma * (1 - gae_lambda) * continues * later)
+    return _discounted_sum(terms, gamma * gae_lambda * continues * ~cut_off)
+
+
+def n_step_returns(rewards: Tensor, values: Tensor, continues: Tensor, cut_off: Tensor, gamma: float, n: int) -> Tensor:
+    """The value of the actions taken with n rewards in place of what it says of them (the first terms of eq. 41):
+    r_t + gamma r_{t+1} + ... + gamma^n Q_{t+n}.
+
+    values: Q [T, W, N], each agent's estimate. The others [T, W], as in `lambda_returns`. Returns [T, W, N]; n = 0 gives Q.
+    """
+    rewards, continues, cut_off = rewards.unsqueeze(-1), continues.unsqueeze(-1), cut_off.unsqueeze(-1)
+    returns = values
+    for _ in range(n):
+        later = torch.cat([returns[1:], torch.zeros_like(returns[:1])])
+        returns = torch.where(cut_off, values, rewards + gamma * continues * later)
+    return returns
+
+
 def normalized(advantages: Tensor) -> Tensor:
     """Mean 0 and deviation 1 over everything."""
     return (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-5)

@@ -8,11 +8,52 @@ not depend on the machine's number of cores.
 
 from __future__ import annotations
 
+from typing import NamedTuple, TypeVar
+
 import torch
 from torch import Tensor
 
 MOST_ROWS = 496   # of a recurrent step in a shard: memory grows with them
 FEWEST_ROWS = 48  # in a shard: starting one costs as much as ten rows
+
+
+class PolicyChunks(NamedTuple):
+    """What the actor learns from: C chunks of L steps."""
+
+    observations: Tensor       # [L, C, N, O]
+    episode_start: Tensor      # [L, C] bool
+    actions: Tensor            # [L, C, N] int64
+    log_probabilities: Tensor  # [L, C, N] of the actions taken, under the acting policy
+    advantages: Tensor         # [L, C, N] normalised
+    weights: Tensor            # [L, C] 1, and 0 for filling
+
+
+class ValueChunks(NamedTuple):
+    """What the critic learns from."""
+
+    states: Tensor         # [L, C, 1, S]
+    episode_start: Tensor  # [L, C] bool
+    values: Tensor         # [L, C] normalised, before the update
+    targets: Tensor        # [L, C] normalised
+    weights: Tensor        # [L, C]
+
+
+class ActionChunks(NamedTuple):
+    """What a network learns from that has a number for every action of an agent: a reward or an action value."""
+
+    inputs: Tensor         # [L, C, 1, I]
+    episode_start: Tensor  # [L, C] bool
+    actions: Tensor        # [L, C, N] int64
+    targets: Tensor        # [L, C] what it should have said of the actions taken
+    weights: Tensor        # [L, C]
+
+
+Chunks = TypeVar('Chunks', PolicyChunks, ValueChunks, ActionChunks)
+
+
+def chosen_chunks(chunks: Chunks, chosen: Tensor | slice) -> Chunks:
+    """Some of the chunks."""
+    return chunks._make(part[:, chosen] for part in chunks)
 
 
 def to_chunks(sequences: Tensor, length: int) -> Tensor:

@@ -60,6 +60,7 @@ class LeadingLearner(Learner):
     def __init__(self, spec: WorldSpec, settings: Settings, team: Team):
         super().__init__(spec, settings.learner, settings.reward_network, settings.run.seed, team,
                          chosen_device(spec, settings))
+        self._team = team
         team.send({'settings': np.frombuffer(json.dumps(config.flatten(settings)).encode(), np.uint8),
                    'spec': np.array(spec, np.int64)})
 

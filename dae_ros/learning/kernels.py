@@ -1,7 +1,6 @@
-"""The compiled kernels from Python: a network's outputs, and the gradient of a loss of them, in one call each.
+"""The compiled kernels for the learner: a network's outputs, and the gradient of a loss of them, in one call each.
 
-`library` is chosen once, at import: the compiled kernels, or None where there is no C compiler or where the environment
-variable DAE_ROS_KERNELS is `torch`; then, and for tensors that are not float32 on the CPU, `networks` computes the same
+Without the library (see `native.library`), and for tensors that are not float32 on the CPU, `networks` computes the same
 with torch's own operations. The two differ by rounding, so a run keeps to one of them. Calls give up Python's lock:
 threads run side by side.
 """
@@ -9,17 +8,13 @@ threads run side by side.
 from __future__ import annotations
 
 import ctypes
-import os
-import warnings
 from typing import NamedTuple, Sequence
 
 import torch
 from torch import Tensor
 
-from dae_ros.learning.native.build import BuildError, library_path
+from dae_ros.learning.native.library import CArray, CBatch, CLoss, CStep, c_step, chosen
 
-_KINDS = {'layer': 0, 'gru': 1, 'fan_out': 2}
-_ACTIVATIONS = {'identity': 0, 'relu': 1, 'tanh': 2}
 _LOSSES = {'policy': 0, 'value': 1, 'reward': 2}
 _MOST_SUMS = 4
 
@@ -53,50 +48,6 @@ class LossTerms(NamedTuple):
     actions: Tensor | None      # [L, C, N] int64
     data: tuple[Tensor, ...]    # at most 2
     weights: Tensor             # [L, C]
-
-
-class _Step(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_long) for name in ('kind', 'activation', 'inputs', 'outputs')]
-    _fields_ += [('parameters', ctypes.c_void_p * 4), ('gradients', ctypes.c_void_p * 4)]
-
-
-class _Array(ctypes.Structure):
-    _fields_ = [('data', ctypes.c_void_p), ('step', ctypes.c_long), ('column', ctypes.c_long)]
-
-
-class _Batch(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_long) for name in ('length', 'columns', 'agents', 'rows')]
-    _fields_ += [(name, _Array) for name in ('inputs', 'start', 'codes')]
-    _fields_ += [(name, ctypes.c_void_p) for name in ('initial', 'table')]
-
-
-class _Loss(ctypes.Structure):
-    _fields_ = [('kind', ctypes.c_long), ('numbers', ctypes.c_double * 3), ('actions', _Array), ('data', _Array * 2),
-                ('weights', _Array)]
-
-
-def _load() -> ctypes.CDLL | None:
-    choice = os.environ.get('DAE_ROS_KERNELS', 'native')
-    if choice not in ('native', 'torch'):
-        raise ValueError(f'DAE_ROS_KERNELS must be native or torch, not {choice!r}')
-    if choice == 'torch':
-        return None
-    try:
-        with library_path() as path:
-            return opened(path)
-    except (BuildError, OSError) as error:
-        warnings.warn(f'the learner runs without its native kernels, several times slower: {error}', stacklevel=2)
-        return None
-
-
-def opened(path: os.PathLike | str) -> ctypes.CDLL:
-    """The library at `path`, ready to be called."""
-    loaded = ctypes.CDLL(str(path))
-    steps, batch, address = ctypes.POINTER(_Step), ctypes.POINTER(_Batch), ctypes.c_void_p
-    loaded.network_forward.argtypes = [steps, ctypes.c_long, batch, address, address]
-    loaded.network_gradient.argtypes = [steps, ctypes.c_long, batch, ctypes.POINTER(_Loss), address, address]
-    loaded.keep_freed_memory()
-    return loaded
 
 
 def available() -> bool:
@@ -144,8 +95,8 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
     numbers = loss.numbers + (0.0,) * (3 - len(loss.numbers))
     shape = agents if loss.kind == 'policy' else columns
     data = [_array(x, shape, torch.float32, kept) for x in (*loss.data, None)[:2]]
-    terms = _Loss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _array(loss.actions, agents, torch.int64, kept),
-                  (_Array * 2)(*data), _array(loss.weights, columns, torch.float32, kept))
+    terms = CLoss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _array(loss.actions, agents, torch.int64, kept),
+                  (CArray * 2)(*data), _array(loss.weights, columns, torch.float32, kept))
     _check(library.network_gradient(_steps(steps, gradients), len(steps), _batch(steps, batch, kept), terms, _address(grad_table),
                                     sums.data_ptr()))
     return flat, grad_table, sums.float()
@@ -164,18 +115,15 @@ def _rows(steps: Sequence[Step], batch: Batch) -> tuple[int, int, int]:
 
 def _steps(steps: Sequence[Step], gradients: dict[int, int]) -> ctypes.Array:
     """`gradients`: by a parameter's address, that of its gradient."""
-    array = (_Step * len(steps))()
-    for entry, step in zip(array, steps):
-        entry.kind, entry.activation = _KINDS[step.kind], _ACTIVATIONS[step.activation]
-        entry.inputs, entry.outputs = step.inputs, step.outputs
-        for place, parameter in enumerate(step.parameters):
-            if parameter is not None:
-                address = _dense(parameter, parameter.shape).data_ptr()
-                entry.parameters[place], entry.gradients[place] = address, gradients.get(address)
+    array = (CStep * len(steps))()
+    for index, step in enumerate(steps):
+        addresses = [None if x is None else _dense(x, x.shape).data_ptr() for x in step.parameters]
+        array[index] = c_step(step.kind, step.activation, step.inputs, step.outputs, addresses)
+        array[index].gradients[:] = [gradients.get(address) for address in addresses]
     return array
 
 
-def _batch(steps: Sequence[Step], batch: Batch, kept: list[Tensor]) -> _Batch:
+def _batch(steps: Sequence[Step], batch: Batch, kept: list[Tensor]) -> CBatch:
     """The batch for a kernel; what must live until that has been called is added to `kept`."""
     L, C = batch.episode_start.shape
     N, R = batch.num_agents, batch.inputs.shape[2]
@@ -191,7 +139,7 @@ def _batch(steps: Sequence[Step], batch: Batch, kept: list[Tensor]) -> _Batch:
         kept.append(batch.table)
         width = next(step.outputs for step in steps if step.kind == 'fan_out')
         table = _dense(batch.table, (L * C * N if batch.codes is None else len(batch.table), width)).data_ptr()
-    return _Batch(L, C, N, R, *arrays, _dense(initial, (C, rows, units)).data_ptr() if rows else None, table)
+    return CBatch(L, C, N, R, *arrays, _dense(initial, (C, rows, units)).data_ptr() if rows else None, table)
 
 
 def _dense(tensor: Tensor, shape: Sequence[int]) -> Tensor:
@@ -200,10 +148,10 @@ def _dense(tensor: Tensor, shape: Sequence[int]) -> Tensor:
     return tensor
 
 
-def _array(tensor: Tensor | None, shape: Sequence[int], dtype: torch.dtype, kept: list[Tensor]) -> _Array:
+def _array(tensor: Tensor | None, shape: Sequence[int], dtype: torch.dtype, kept: list[Tensor]) -> CArray:
     """A tensor [L, C, ...]; copied only if what belongs to one step of a column does not lie together."""
     if tensor is None:
-        return _Array(None, 0, 0)
+        return CArray(None, 0, 0)
     if tensor.dtype != dtype or tensor.shape != torch.Size(shape):
         raise ValueError(f'{tensor.dtype} {tuple(tensor.shape)} where {dtype} {tuple(shape)} is needed')
     inner, together = 1, True
@@ -214,7 +162,7 @@ def _array(tensor: Tensor | None, shape: Sequence[int], dtype: torch.dtype, kept
         tensor = tensor.contiguous()
     kept.append(tensor)
     step, column = tensor.stride()[:2]
-    return _Array(tensor.data_ptr(), step // inner, column // inner)
+    return CArray(tensor.data_ptr(), step // inner, column // inner)
 
 
 def _address(tensor: Tensor | None) -> int | None:
@@ -226,4 +174,6 @@ def _check(failed: int) -> None:
         raise MemoryError('no memory for the scratch space of a network')
 
 
-library = _load()
+library = chosen()
+if library is not None:
+    library.keep_freed_memory()

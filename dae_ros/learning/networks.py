@@ -295,6 +295,11 @@ def make_reward_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: 
     return _initialise(network, _GAINS['relu'], 1.0, seed, f'reward_network.{member}')
 
 
+def make_action_value_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int) -> RewardNetwork:
+    """Q(s, a_-i, .) of COMA, built like the reward network."""
+    return _initialise(REWARD_NETWORKS[settings.architecture](spec, settings), _GAINS['relu'], 1.0, seed, 'action_value')
+
+
 def _initialise(network: nn.Module, hidden_gain: float, head_gain: float, seed: int, name: str):
     """Orthogonal weights, zero biases, LayerNorms at the identity; drawn by a key of the network's own."""
     generator = torch.Generator().manual_seed(draws.key(seed, f'initialise {name}') % 2**63)

@@ -1,19 +1,22 @@
-"""The decentralised policy in plain numpy: what a robot needs to act, without torch.
+"""The decentralised policy: what a robot needs to act, without torch.
 
 Actor of recurrent MAPPO (paper, algorithm 1, line 11): LayerNorm, MLP with LayerNorm after each activation, GRU,
-LayerNorm, linear head, softmax. The learner trains the same network in torch (`dae_ros.learning.networks.Actor`); a test
-holds the two together. Acting in numpy starts fast, answers one observation in tens of microseconds and gives the same
-bits in every process that acts on the same batch.
+LayerNorm, linear head, softmax. The learner trains the same network (`dae_ros.learning.networks.RecurrentNetwork`); a test
+holds the two together. Acting starts fast, answers one observation in microseconds and gives the same bits in every
+process that acts on the same batch.
 """
 
 from __future__ import annotations
 
+import ctypes
 from typing import Mapping, NamedTuple
 
 import numpy as np
 
 from dae_ros import draws
+from dae_ros.learning.native import library
 
+_FLOAT, _BOOL = np.dtype(np.float32), np.dtype(bool)
 LAYER_NORM_EPSILON = np.float32(1e-5)
 
 
@@ -55,19 +58,79 @@ class Policy:
         if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != expected:
             raise ValueError(f'these tensors are not a policy of {architecture}')
         self.architecture = architecture
-        self.tensors = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in tensors.items()}
-        self._fold()
+        self.tensors = {name: np.array(tensor, np.float32, order='C') for name, tensor in tensors.items()}
+        compiled = library.chosen()
+        self._network = (_InNumpy(architecture, self.tensors) if compiled is None
+                         else _Compiled(architecture, self.tensors, compiled))
 
-    def _fold(self) -> None:
+    def initial_state(self, num_worlds: int) -> np.ndarray:
+        """Recurrent state before an episode: zeros [W, H]."""
+        return np.zeros((num_worlds, self.architecture.hidden_size), np.float32)
+
+    def act(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Action probabilities and the next recurrent state.
+
+        values: observations [W, O] float32. state: [W, H] float32. episode_start: [W] bool; the state is forgotten there.
+        Returns ([W, A] float32 with rows that sum to 1, [W, H] float32). ValueError if an argument is of another shape or
+        type.
+        """
+        values, state, episode_start = map(np.ascontiguousarray, (values, state, episode_start))
+        W = len(values)
+        given = values.shape, values.dtype, state.shape, state.dtype, episode_start.shape, episode_start.dtype
+        needed = (W, self.architecture.observation_size), _FLOAT, (W, self.architecture.hidden_size), _FLOAT, (W,), _BOOL
+        if given != needed:
+            raise ValueError(f'observations, state and episode starts are {given} where {needed} is needed')
+        return self._network(values, state, episode_start)
+
+
+class _Compiled:
+    """The network by the compiled kernels. A world's bits do not depend on the worlds beside it."""
+
+    def __init__(self, architecture: PolicyArchitecture, tensors: Mapping[str, np.ndarray], compiled: ctypes.CDLL):
+        O, A, H, mlp_layers, activation = architecture
+
+        def step(kind: str, activation: str, inputs: int, outputs: int, *names: str | None) -> library.CStep:
+            addresses = [None if name is None else tensors[name].ctypes.data for name in names]
+            return library.c_step(kind, activation, inputs, outputs, addresses)
+
+        def norm(size: int, name: str) -> library.CStep:
+            return step('layer', 'identity', size, size, None, None, f'{name}.weight', f'{name}.bias')
+
+        mlp = [step('layer', activation, H if layer else O, H, f'mlp.{layer}.weight', f'mlp.{layer}.bias',
+                    f'mlp_norm.{layer}.weight', f'mlp_norm.{layer}.bias') for layer in range(mlp_layers)]
+        gru = step('gru', 'identity', H, H, 'gru.weight_ih', 'gru.weight_hh', 'gru.bias_ih', 'gru.bias_hh')
+        head = step('layer', 'identity', H, A, 'head.weight', 'head.bias', None, None)
+        row = [norm(O, 'input_norm'), *mlp, gru, norm(H, 'gru_norm'), head]
+        steps = (library.CStep * len(row))(*row)
+        packed = np.empty(compiled.policy_pack(steps, len(row), None), np.uint8)
+        compiled.policy_pack(steps, len(row), packed.ctypes.data)
+        self._kept = tensors, steps, packed  # what lies at the addresses below
+        self._network = ctypes.addressof(steps), len(row), packed.ctypes.data
+        self._act, self._sizes = compiled.policy_act, (A, H)
+
+    def __call__(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        W, (A, H) = len(values), self._sizes
+        probabilities, next_state = np.empty((W, A), np.float32), np.empty((W, H), np.float32)
+        if self._act(*self._network, W, values.ctypes.data, state.ctypes.data, episode_start.ctypes.data,
+                     probabilities.ctypes.data, next_state.ctypes.data):
+            raise MemoryError(f'no memory to act in {W} worlds')
+        return probabilities, next_state
+
+
+class _InNumpy:
+    """The network in plain numpy: the reference for the compiled kernels, and what there is without a C compiler."""
+
+    def __init__(self, architecture: PolicyArchitecture, tensors: Mapping[str, np.ndarray]):
         """Prepares one product for each layer: a LayerNorm's scale and shift go into the layer after it, and biases are
         rows of the matrices, which a column of ones picks out of `_standardised`."""
-        H, exact = self.architecture.hidden_size, {name: tensor.astype(np.float64) for name, tensor in self.tensors.items()}
+        self._architecture = architecture
+        H, exact = architecture.hidden_size, {name: tensor.astype(np.float64) for name, tensor in tensors.items()}
 
         def after(norm: str, weight: np.ndarray, bias: np.ndarray) -> np.ndarray:
             """[inputs + 1, outputs]: weight [outputs, inputs] and bias of a layer, behind the LayerNorm `norm`."""
             return np.vstack([(weight * exact[f'{norm}.weight']).T, bias + weight @ exact[f'{norm}.bias']])
 
-        norms = ['input_norm', *(f'mlp_norm.{layer}' for layer in range(self.architecture.mlp_layers))]
+        norms = ['input_norm', *(f'mlp_norm.{layer}' for layer in range(architecture.mlp_layers))]
         layers = [after(norm, exact[f'mlp.{layer}.weight'], exact[f'mlp.{layer}.bias']) for layer, norm in enumerate(norms[:-1])]
         # Of [x, 1, state]: reset and update gates with their signs turned, as the sigmoid needs them, then the candidate's
         # part from the input and, apart from it, its part from the state, which the reset gate scales.
@@ -79,23 +142,14 @@ class Policy:
         gru[:, :2 * H] *= -1
         self._layers = [layer.astype(np.float32) for layer in layers]
         self._gru = gru.astype(np.float32)
-        self._averages = [np.full(size, 1 / size, np.float32) for size in (self.architecture.observation_size, H)]
+        self._averages = [np.full(size, 1 / size, np.float32) for size in (architecture.observation_size, H)]
         self._head = np.ascontiguousarray(after('gru_norm', exact['head.weight'], exact['head.bias']).T, np.float32)
 
-    def initial_state(self, num_worlds: int) -> np.ndarray:
-        """Recurrent state before an episode: zeros [W, H]."""
-        return np.zeros((num_worlds, self.architecture.hidden_size), np.float32)
-
-    def act(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Action probabilities and the next recurrent state.
-
-        values: observations [W, O] float32. state: [W, H] float32. episode_start: [W] bool; the state is forgotten there.
-        Returns ([W, A] float32 with rows that sum to 1, [W, H] float32).
-        """
-        H, x, (average, hidden_average) = self.architecture.hidden_size, values, self._averages
+    def __call__(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        H, x, (average, hidden_average) = self._architecture.hidden_size, values, self._averages
         for layer in self._layers:
             x = _standardised(x, average) @ layer
-            x = np.maximum(x, 0, out=x) if self.architecture.activation == 'relu' else np.tanh(x, out=x)
+            x = np.maximum(x, 0, out=x) if self._architecture.activation == 'relu' else np.tanh(x, out=x)
             average = hidden_average
         x = _standardised(x, average, room=H)
         remembered = x[:, H + 1:]

@@ -24,7 +24,7 @@ class MatrixGame(SynchronousWorlds):
         if task.observe_others:
             raise SettingsError('observe_others belongs to formation and line; set it to false for the matrix game')
         spec = WorldSpec(num_agents, num_agents, num_agents, num_agents, state_is_observations=False)
-        super().__init__(spec, task.num_worlds, task.episode_steps or num_agents)
+        super().__init__(spec, task, task.episode_steps or num_agents)
         self._turn = 0  # step of the episode, and the agent whose action counts there
         self._reward = np.zeros(task.num_worlds)
 
@@ -32,11 +32,20 @@ class MatrixGame(SynchronousWorlds):
         self._turn = 0
 
     def advance(self, actions: np.ndarray) -> None:
-        self._reward = actions[:, self._turn] + 1 - (self.spec.num_agents + 1) / 2
+        self._reward = self._reward_of(actions[:, self._turn])
         self._turn += 1
 
     def reward(self) -> np.ndarray:
         return self._reward
+
+    def alternatives(self, actions: np.ndarray) -> np.ndarray:
+        num_agents, num_actions = self.spec.num_agents, self.spec.num_actions
+        rewards = np.tile(self._reward_of(actions[:, self._turn]), (num_agents, num_actions, 1))
+        rewards[self._turn] = self._reward_of(np.arange(num_actions))[:, None]
+        return rewards
+
+    def _reward_of(self, action: np.ndarray) -> np.ndarray:
+        return action + 1 - (self.spec.num_agents + 1) / 2
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
         observations = np.zeros((self.num_worlds, self.spec.num_agents, self.spec.observation_size), dtype=np.float32)

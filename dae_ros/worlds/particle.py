@@ -8,7 +8,9 @@ in a fixed order, so that a world's numbers depend neither on W nor on its neigh
 
 from __future__ import annotations
 
+import dataclasses
 from abc import abstractmethod
+from functools import cached_property
 
 import numpy as np
 
@@ -42,7 +44,8 @@ class ParticleWorlds(SynchronousWorlds):
         num_others = num_agents - 1 if observe_others else 0
         size = 4 + 2 * num_landmarks + 2 * num_others + unused_features
         spec = WorldSpec(num_agents, ACTION_FORCE.shape[1], size, num_agents * size, state_is_observations=True)
-        super().__init__(spec, num_worlds, task.episode_steps or EPISODE_STEPS)
+        super().__init__(spec, task, task.episode_steps or EPISODE_STEPS)
+        self._task = task
 
         # The observations, worlds last, are also where the state lives: the arrays below are views into them.
         self._features = np.zeros((num_agents, size, num_worlds))
@@ -104,6 +107,26 @@ class ParticleWorlds(SynchronousWorlds):
         self._velocity += force
         self._position += TIME_STEP * self._velocity
         self._look()
+
+    def alternatives(self, actions: np.ndarray) -> np.ndarray:
+        num_agents, num_actions = self.spec.num_agents, self.spec.num_actions
+        copies, all_actions = self._copies, np.repeat(np.arange(num_actions), self.num_worlds)
+        state = [np.tile(array, (num_actions, 1, 1)) for array in (self.positions, self.velocities, self.landmarks)]
+        rewards = np.empty((num_agents, num_actions, self.num_worlds))
+        # One agent after the other, so that the copies stay in the cache.
+        for agent in range(num_agents):
+            joint = np.tile(actions, (num_actions, 1))
+            joint[:, agent] = all_actions
+            copies.set_state(*state)
+            copies.advance(joint)
+            rewards[agent] = copies.reward().reshape(num_actions, self.num_worlds)
+        return rewards
+
+    @cached_property
+    def _copies(self) -> ParticleWorlds:
+        """Room for A copies of these worlds, to try actions in."""
+        num_copies = self.spec.num_actions * self.num_worlds
+        return type(self)(dataclasses.replace(self._task, num_worlds=num_copies, world_groups=1))
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
         features = self._features.reshape(self.spec.state_size, self.num_worlds)

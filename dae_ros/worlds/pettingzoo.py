@@ -30,13 +30,15 @@ class PettingZooWorlds(Worlds):
     - Every episode is seeded from (seed, 'reset', rollout, step, world). Python's and NumPy's global generators, which
       some environments use, are seeded from (seed, 'global', rollout, step) while the environments run, and put back.
 
-    Raises WorldError for what cannot be simulated, SettingsError if num_agents or episode_steps do not fit.
+    Raises WorldError for what cannot be simulated, SettingsError for settings that do not fit.
     """
 
     def __init__(self, task: TaskSettings):
         self._name = task.task
         if task.observe_others:
             raise SettingsError(f'observe_others belongs to formation and line; set it to false for {self._name}')
+        if task.reward_delay:
+            raise SettingsError(f'reward_delay belongs to the built-in tasks; set it to 0 for {self._name}')
         build = _find_parallel_env(task.task)
         self.num_worlds = task.num_worlds
         self._environments: list[Any] = []

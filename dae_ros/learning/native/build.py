@@ -1,12 +1,13 @@
 """Compiles kernels.c for this processor, once per user and machine.
 
-The library is built where it is first needed, so every way of installing the package gives the same fast learner, and
+The library is built where it is first needed, so every way of installing the package gives the same speed, and
 the instructions are always those of the processor that runs them.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import os
 import platform
@@ -48,7 +49,7 @@ def library_path() -> Iterator[Path]:
     """Path of the compiled library while the block runs; compiled now if this user has none for processor and source.
 
     It is kept in $XDG_CACHE_HOME/dae_ros (~/.cache/dae_ros), or, if nothing can be written there, in a folder that is
-    removed again. Processes that start at once may each compile; all end with a whole file. Raises BuildError.
+    removed again. Of processes that start at once, one compiles and the others wait for it. Raises BuildError.
     """
     name = f'kernels-{_key()}.so'
     folder = Path(os.environ.get('XDG_CACHE_HOME') or Path('~/.cache').expanduser()) / 'dae_ros'
@@ -60,8 +61,22 @@ def library_path() -> Iterator[Path]:
     with contextlib.nullcontext(folder) if usable else tempfile.TemporaryDirectory() as chosen:
         path = Path(chosen) / name
         if not path.exists():
-            build(path)
+            with _locked(path.parent):
+                if not path.exists():
+                    build(path)
         yield path
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """One process at a time, if the file system can lock a folder; else several compile, each a whole file."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _compiler() -> list[str]:

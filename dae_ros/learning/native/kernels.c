@@ -1,4 +1,5 @@
-/* The learner's networks on one core: what they give for a batch of sequences, and the gradient of a loss of it.
+/* The learner's networks on one core: what they give for a batch of sequences, and the gradient of a loss of it; and the
+ * policy for the robots that act.
  *
  * Plain C with the vector extensions of GCC and clang. All matrices are row-major float32 and may lie at any address.
  * A result's bits depend on the numbers that went in alone: every sum runs in one fixed order, whatever the alignment,
@@ -7,8 +8,9 @@
  * A batch goes through its network in blocks of a few columns, forward, loss and backward, so that what the backward
  * pass needs of the forward pass is still in the cache.
  *
- * Products run on register tiles of ROWS x COLUMNS. Their right operand is packed once per call into panels of COLUMNS
- * columns, zero-padded; a panel's block of DEPTH rows stays in the first-level cache while the rows pass by it.
+ * Products run on register tiles of ROWS x COLUMNS. Their right operand is packed into panels of COLUMNS columns,
+ * zero-padded, once per call or, for a policy, once and for all; a panel's block of DEPTH rows stays in the first-level
+ * cache while the rows pass by it.
  */
 
 #include <math.h>
@@ -826,6 +828,13 @@ static void fan_out_backward(const Step *step, const Work *work, long N, const f
     }
 }
 
+static float largest_of(long n, const float *x) {
+    float largest = x[0];
+    for (long i = 1; i < n; i++)
+        largest = x[i] > largest ? x[i] : largest;
+    return largest;
+}
+
 /* Losses: sums over weighted rows, each with its gradient. */
 
 enum { POLICY = 0, VALUE = 1, REWARD = 2 };
@@ -846,9 +855,7 @@ static void policy_loss(long T, long N, long A, const Loss *loss, const float *l
     const float clip = (float)loss->numbers[0], bonus = (float)loss->numbers[1];
     double surrogates = 0, entropies = 0, clipped = 0, divergences = 0;
     for (long row = 0; row < T; row++, logits += A, grad += A) {
-        float largest = logits[0];
-        for (long a = 1; a < A; a++)
-            largest = logits[a] > largest ? logits[a] : largest;
+        const float largest = largest_of(A, logits);
         vec total = all(0), expected = all(0);
         FOR_EACH_VECTOR(A, {
             vec apart = load_upto(logits + j, lanes) - all(largest);
@@ -926,7 +933,38 @@ static long rows_at_gru(const Step *steps, long count, const Batch *batch) {
     return rows;
 }
 
-/* Hands out the memory of all steps for blocks of `columns` columns; without `loss`, what a forward pass needs. */
+/* Hands out the memory of the packed weights; those of the backward pass only if the network `learns`. */
+static void plan_weights(Arena *arena, const Step *steps, long count, int learns, Work *works) {
+    for (long i = 0; i < count; i++) {
+        const long I = steps[i].inputs, O = steps[i].outputs;
+        Work *work = works + i;
+        if (steps[i].kind == GRU) {
+            work->forward = take(arena, 3 * packed_size(I + O, O));
+            work->backward = learns ? take(arena, packed_size(3 * O, I)) : NULL;
+            work->backward_state = learns ? take(arena, packed_size(3 * O, O)) : NULL;
+        } else if (steps[i].kind == LAYER && steps[i].parameters[0]) {
+            work->forward = take(arena, packed_size(I, O));
+            work->backward = learns ? take(arena, packed_size(O, I)) : NULL;
+        }
+    }
+}
+
+static void pack_weights(const Step *steps, long count, int learns, Work *works) {
+    for (long i = 0; i < count; i++) {
+        const Step *step = steps + i;
+        if (step->kind == GRU) {
+            pack_gru(step, works[i].forward);
+            if (learns)
+                pack_gru_backward(step, works + i, i > 0);
+        } else if (step->kind == LAYER && step->parameters[0]) {
+            pack_transposed(step->inputs, step->outputs, step->parameters[0], works[i].forward);
+            if (learns && i > 0)
+                pack(step->outputs, step->inputs, step->parameters[0], step->inputs, works[i].backward, step->outputs);
+        }
+    }
+}
+
+/* Hands out the rest of the memory for blocks of `columns` columns; without `loss`, what a forward pass needs. */
 static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *batch, const Loss *loss, long columns,
                     Work *works) {
     Scratch s = {0};
@@ -943,14 +981,8 @@ static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *ba
         work->activated = keeps_activated(step) || step->kind == FAN_OUT ? take(arena, work->count * O) : NULL;
         work->statistics = take(arena, 2 * work->count);
         if (step->kind == GRU) {
-            work->forward = take(arena, 3 * packed_size(I + O, O));
             work->gates = loss ? take(arena, work->count * 4 * round_up(O, COLUMNS)) : NULL;
-            work->backward = loss ? take(arena, packed_size(3 * O, I)) : NULL;
-            work->backward_state = loss ? take(arena, packed_size(3 * O, O)) : NULL;
             units = max(units, O);
-        } else if (step->kind == LAYER && step->parameters[0]) {
-            work->forward = take(arena, packed_size(I, O));
-            work->backward = loss ? take(arena, packed_size(O, I)) : NULL;
         }
         inputs = max(inputs, I);
         outputs = max(outputs, O);
@@ -1070,29 +1102,25 @@ static void backward_block(const Step *steps, long count, const Batch *batch, lo
     }
 }
 
-/* Forward passes over all columns, and with `loss` backward passes, too. Returns 0, or 1 if there is no memory. */
-static int run(const Step *steps, long count, const Batch *batch, const Loss *loss, float *outputs, float *states,
-               float *grad_table, double *sums) {
+/* Forward passes over all columns, and with `loss` backward passes, too. `packed`: memory in which the weights lie packed
+ * already, or NULL. Returns 0, or 1 if there is no memory. */
+static int run(const Step *steps, long count, void *packed, const Batch *batch, const Loss *loss, float *outputs,
+               float *states, float *grad_table, double *sums) {
     const long L = batch->length, C = batch->columns, size = (long)sizeof(float);
     const long block = max(1, min(C, BLOCK / rows_at_gru(steps, count, batch)));
+    const int learns = loss != NULL;
     Work works[MOST_STEPS] = {0};
-    Arena arena = {0};
+    Arena arena = {0}, prepared = {packed, 0};
+    plan_weights(packed ? &prepared : &arena, steps, count, learns, works);
     plan(&arena, steps, count, batch, loss, block, works);
     if (!begin_arena(&arena))
         return 1;
+    if (!packed)
+        plan_weights(&arena, steps, count, learns, works);
     Scratch s = plan(&arena, steps, count, batch, loss, block, works);
     const unsigned long mode = begin_flush();
-    for (long i = 0; i < count; i++)
-        if (steps[i].kind == GRU) {
-            pack_gru(steps + i, works[i].forward);
-            if (loss)
-                pack_gru_backward(steps + i, works + i, i > 0);
-        } else if (steps[i].kind == LAYER && steps[i].parameters[0]) {
-            pack_transposed(steps[i].inputs, steps[i].outputs, steps[i].parameters[0], works[i].forward);
-            if (loss && i > 0)
-                pack(steps[i].outputs, steps[i].inputs, steps[i].parameters[0], steps[i].inputs, works[i].backward,
-                     steps[i].outputs);
-        }
+    if (!packed)
+        pack_weights(steps, count, learns, works);
     for (long first = 0; first < C; first += block) {
         const long columns = min(block, C - first);
         forward_block(steps, count, batch, first, columns, works, &s);
@@ -1115,11 +1143,52 @@ static int run(const Step *steps, long count, const Batch *batch, const Loss *lo
 
 /* outputs [L, C, rows at the end, outputs of the last step]; states [L, C, rows at the GRU, H] after each step. */
 int network_forward(const Step *steps, long count, const Batch *batch, float *outputs, float *states) {
-    return run(steps, count, batch, NULL, outputs, states, NULL, NULL);
+    return run(steps, count, NULL, batch, NULL, outputs, states, NULL, NULL);
 }
 
 /* Adds the gradients of the loss to those of the steps and to grad_table [K, O], and the loss's sums to `sums` [at most 4]. */
 int network_gradient(const Step *steps, long count, const Batch *batch, const Loss *loss, float *grad_table,
                      double *sums) {
-    return run(steps, count, batch, loss, NULL, NULL, grad_table, sums);
+    return run(steps, count, NULL, batch, loss, NULL, NULL, grad_table, sums);
+}
+
+/* Acting. */
+
+/* Each row of A scores to their exponentials over the sum of these. */
+static void softmax(long rows, long A, float *scores) {
+    for (long row = 0; row < rows; row++, scores += A) {
+        const vec largest = all(largest_of(A, scores));
+        vec total = all(0);
+        FOR_EACH_VECTOR(A, {
+            store_upto(scores + j, exp_of(load_upto(scores + j, lanes) - largest, 87), lanes);
+            total += load_upto(scores + j, lanes); /* nothing beyond the last action */
+        });
+        const vec inverse = all(1 / sum_of(total));
+        FOR_EACH_VECTOR(A, { store_upto(scores + j, load_upto(scores + j, lanes) * inverse, lanes); });
+    }
+}
+
+static void *aligned(void *memory) { return (void *)(((uintptr_t)memory + 63) & ~(uintptr_t)63); }
+
+/* Packs the weights of a policy, whose steps are layers and a GRU, into `memory` unless this is NULL. Returns how many
+ * bytes that needs. */
+long policy_pack(const Step *steps, long count, void *memory) {
+    Work works[MOST_STEPS] = {0};
+    Arena arena = {aligned(memory), 0};
+    plan_weights(&arena, steps, count, 0, works);
+    if (memory)
+        pack_weights(steps, count, 0, works);
+    return 63 + (long)arena.used;
+}
+
+/* Probabilities [W, A] of the actions and the next states [W, H], for observations [W, O], states [W, H] and episode
+ * starts [W] of W worlds; `packed` by policy_pack. A world's bits do not depend on the others. */
+int policy_act(const Step *steps, long count, void *packed, long worlds, const float *observations, const float *states,
+               const uint8_t *episode_start, float *probabilities, float *next_states) {
+    const Batch batch = {.length = 1, .columns = worlds, .agents = 1, .rows = 1, .inputs = {observations, worlds, 1},
+                         .start = {episode_start, worlds, 1}, .initial = states};
+    if (run(steps, count, aligned(packed), &batch, NULL, probabilities, next_states, NULL, NULL))
+        return 1;
+    softmax(worlds, steps[count - 1].outputs, probabilities);
+    return 0;
 }

@@ -1,0 +1,247 @@
+"""Advantage estimators with the networks they learn: DAE, of which GAE is a case, and COMA's counterfactual advantages.
+
+An estimator is given a rollout as a `Trajectory` of tensors and answers with everybody's advantages and with the trainings
+of its networks on that rollout. The actor's training is the same whatever the estimator.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Iterable, Mapping, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dae_ros.config import LearnerSettings, RewardNetworkSettings
+from dae_ros.learning import advantages, losses
+from dae_ros.learning.chunks import ActionChunks, ValueChunks, first_states, to_chunks
+from dae_ros.learning.networks import RewardNetwork, make_action_value_network, make_critic, make_reward_network
+from dae_ros.learning.optimizer import FlatAdam
+from dae_ros.learning.parallel import Training
+from dae_ros.learning.passes import Batch, Passes
+from dae_ros.learning.reward_replay import RewardReplay
+from dae_ros.learning.value_norm import ValueNormalizer
+from dae_ros.types import Trajectory, WorldSpec
+
+
+class Estimate(NamedTuple):
+    """What an estimator makes of a rollout."""
+
+    advantages: Tensor          # [T, W, N], not normalised
+    trainings: list[Training]   # of its networks
+    metrics: dict[str, float]
+
+
+class ActionNetwork:
+    """A network f(s, a_-i, .) with a number for every action of an agent, and how it learns that of the action taken."""
+
+    def __init__(self, name: str, network: RewardNetwork, learning_rate: float, settings: LearnerSettings, passes: Passes):
+        self.name = name
+        self.adam = FlatAdam(network.to(passes.device), learning_rate, settings.adam_epsilon, settings.max_gradient_norm)
+        self._passes = passes
+
+    def inputs(self, data: Trajectory) -> Tensor:
+        """What it reads of a rollout, [T, W, 1, I]; the same for networks of the same architecture."""
+        return self.adam.network.inputs(data.states[:-1].unsqueeze(2), data.actions, data.episode_start[:-1])
+
+    def predict(self, inputs: Tensor, data: Trajectory) -> tuple[Tensor, Tensor]:
+        """Predictions [T, W, N, A] and recurrent states [T, W, N or 1, H]."""
+        network = self.adam.network
+        return self._passes.forward(network, network.states_per_world(), inputs, data.episode_start[:-1], data.actions)
+
+    def training(self, batches: Iterable[Batch], loss_name: str) -> Training:
+        """Gradient steps of half the squared error on batches of `ActionChunks`."""
+        network = self.adam.network
+
+        def gradient(shard: ActionChunks, initial: Tensor) -> tuple[Tensor, Tensor]:
+            loss = losses.RewardLoss(shard.actions, shard.targets, shard.weights / network.num_agents)
+            return network.gradient(loss, shard.inputs, initial, shard.episode_start, shard.actions)
+
+        return self._passes.train(self.name, self.adam, gradient, batches, network.num_agents, (loss_name,))
+
+
+class DifferenceEstimator:
+    """DAE (section 3.3): GAE of a central critic, less what each agent's reward was to be expected without knowing its action.
+
+    At beta = 0 it is GAE, has no reward network and is plain MAPPO.
+    """
+
+    def __init__(self, spec: WorldSpec, settings: LearnerSettings, reward_settings: RewardNetworkSettings, seed: int,
+                 passes: Passes):
+        self._settings = settings
+        self._reward_settings = reward_settings
+        self._passes = passes
+        self._critic = FlatAdam(make_critic(spec, settings, seed).to(passes.device), settings.learning_rate,
+                                settings.adam_epsilon, settings.max_gradient_norm)
+        self._value_norm = ValueNormalizer()
+        self._reward = [ActionNetwork(f'reward_network.{member}', make_reward_network(spec, reward_settings, seed, member),
+                                      reward_settings.learning_rate, settings, passes)
+                        for member in range(reward_settings.ensemble_size if settings.beta > 0 else 0)]
+        self._replay = RewardReplay(reward_settings, seed) if self._reward and reward_settings.replay_rollouts else None
+
+    def estimate(self, data: Trajectory, rollout: int) -> Estimate:
+        """Advantages (algorithm 1, line 19), and the trainings of critic and reward networks on the rollout."""
+        settings, metrics, trainings = self._settings, {}, []
+        continues = (~(data.terminated | data.truncated)).float()
+
+        # Line 13: values, by the critic as it is before the update.
+        normalized_values, critic_states, final_values = self._values(data)
+        values = self._value_norm.denormalize(normalized_values)
+        next_values = values[1:] * continues
+        next_values[data.truncated] = self._value_norm.denormalize(final_values)
+        team = advantages.generalized_advantages(data.rewards, values[:-1], next_values, continues, settings.gamma,
+                                                 settings.gae_lambda)
+        estimated = team.unsqueeze(-1).expand(data.actions.shape)
+        if self._reward:
+            remembered = self._remembered(data)
+            predicted, inputs, states = self._predicted_rewards(remembered)
+            expected = advantages.expected_rewards(predicted, data.probabilities)
+            estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
+                                                                settings.gae_lambda)
+            taken = advantages.of_actions(predicted, data.actions)
+            error = (taken - data.rewards.unsqueeze(-1)).square().mean()
+            metrics['reward_network/explained_variance'] = float(
+                1 - error / data.rewards.var(correction=0).clamp_min(1e-12))
+            trainings = self._reward_trainings(remembered, inputs, states, rollout)
+
+        # Line 20: value targets; the critic sees one state per world, so it regresses on the agents' mean.
+        targets = values[:-1] + (estimated.mean(-1) if settings.value_target == 'difference' else team)
+        self._value_norm.update(targets)
+        cut = partial(to_chunks, length=chunk_length(data, settings))
+        chunks = ValueChunks(cut(data.states[:-1].unsqueeze(2)), cut(data.episode_start[:-1]), cut(normalized_values[:-1]),
+                             cut(self._value_norm.normalize(targets)), cut(torch.ones_like(data.rewards)))
+        first = first_states(critic_states[:-1], chunks.weights.shape[0])
+        return Estimate(estimated, [self._critic_training(chunks, first, rollout), *trainings], metrics)
+
+    def expected_rewards(self, data: Trajectory) -> Tensor:
+        """E over a_i ~ pi_i of the predicted reward, [T, W, N]. Raises ValueError at beta = 0, which has no reward network."""
+        if not self._reward:
+            raise ValueError('at beta = 0 there is no reward network')
+        return advantages.expected_rewards(self._predicted_rewards(self._remembered(data))[0], data.probabilities)
+
+    def networks(self) -> dict[str, FlatAdam]:
+        return {'critic': self._critic} | {member.name: member.adam for member in self._reward}
+
+    def state(self) -> dict[str, Tensor]:
+        """All but the networks."""
+        return {'value_norm': self._value_norm.state()} | (self._replay.state() if self._replay else {})
+
+    def load_state(self, tensors: Mapping[str, Tensor]) -> None:
+        self._value_norm.load_state(tensors['value_norm'])
+        if self._replay:
+            self._replay.load_state(tensors)
+
+    def _values(self, data: Trajectory):
+        """Normalised values [T + 1, W], the critic's recurrent states [T + 1, W, 1, H], values [K] of the final states."""
+        critic = self._critic.network
+        outputs, hidden = self._passes.forward(critic, 1, data.states.unsqueeze(2), data.episode_start)
+        with torch.no_grad():
+            ongoing = torch.zeros(1, len(data.final_states), dtype=torch.bool, device=outputs.device)
+            final_values = critic(data.final_states[None, :, None], hidden[:-1][data.truncated], ongoing)[0].view(-1)
+        return outputs.flatten(1), hidden, final_values
+
+    def _remembered(self, data: Trajectory) -> Trajectory:
+        """The rollout as far as the reward networks remember it: without memory, every step begins an episode."""
+        if self._reward_settings.recurrent:
+            return data
+        return data._replace(episode_start=torch.ones_like(data.episode_start))
+
+    def _predicted_rewards(self, data: Trajectory) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """The ensemble's mean prediction [T, W, N, A], what it is made from, and each member's recurrent states."""
+        inputs = self._reward[0].inputs(data)
+        predictions = [member.predict(inputs, data) for member in self._reward]
+        return torch.stack([predicted for predicted, _ in predictions]).mean(0), inputs, [states for _, states in predictions]
+
+    def _critic_training(self, chunks: ValueChunks, first: Tensor, rollout: int) -> Training:
+        settings, network = self._settings, self._critic.network
+
+        def gradient(shard: ValueChunks, initial: Tensor) -> tuple[Tensor, Tensor]:
+            loss = losses.ValueLoss(shard.values, shard.targets, shard.weights, settings.clip, settings.huber_delta,
+                                    settings.value_coefficient)
+            return network.gradient(loss, shard.states, initial, shard.episode_start)
+
+        batches = self._passes.epochs('critic', chunks, first, settings.epochs, settings.num_mini_batches, rollout)
+        return self._passes.train('critic', self._critic, gradient, batches, 1, losses.ValueLoss.sums)
+
+    def _reward_trainings(self, data: Trajectory, inputs: Tensor, states: list[Tensor], rollout: int) -> list[Training]:
+        chunks = action_chunks(data, inputs, data.rewards, self._settings)
+        firsts = [first_states(own, len(chunks.weights)) for own in states]
+        if self._replay:
+            self._replay.add(chunks, firsts)
+        trainings = []
+        for member, (network, first) in enumerate(zip(self._reward, firsts)):
+            if self._replay:
+                batches = self._replay.batches(member, rollout)
+            else:
+                batches = self._passes.epochs(network.name, chunks, first, self._reward_settings.epochs,
+                                              self._settings.num_mini_batches, rollout)
+            trainings.append(network.training(batches, 'reward_network/loss'))
+        return trainings
+
+
+class CounterfactualEstimator:
+    """COMA on MAPPO: Q less its average over the agent's own action (eq. 3), with Q optionally expanded by n rewards (eq. 41).
+
+    Q has the reward network's architecture and settings and regresses on lambda returns, the agents' mean of them, in the
+    scale of a running normaliser. There is no critic V.
+    """
+
+    def __init__(self, spec: WorldSpec, settings: LearnerSettings, network_settings: RewardNetworkSettings, seed: int,
+                 passes: Passes):
+        self._settings = settings
+        self._epochs = network_settings.epochs
+        self._num_rewards = settings.coma_steps if settings.estimator == 'coma_nstep' else 0
+        self._passes = passes
+        self._action_value = ActionNetwork('action_value', make_action_value_network(spec, network_settings, seed),
+                                           network_settings.learning_rate, settings, passes)
+        self._value_norm = ValueNormalizer()
+
+    def estimate(self, data: Trajectory, rollout: int) -> Estimate:
+        """Counterfactual advantages, and the training of Q on the rollout."""
+        settings, network = self._settings, self._action_value
+        continues = (~(data.terminated | data.truncated)).float()
+        # Where the next joint action is unknown, Q of the last one taken stands for all that follows.
+        cut_off = data.truncated.clone()
+        cut_off[-1] = ~data.terminated[-1]
+
+        inputs = network.inputs(data)
+        normalized, states = network.predict(inputs, data)
+        values = self._value_norm.denormalize(normalized)
+        taken = advantages.of_actions(values, data.actions)
+        later = advantages.n_step_returns(data.rewards, taken, continues, cut_off, settings.gamma, self._num_rewards)
+        estimated = later - advantages.expected_rewards(values, data.probabilities)
+
+        targets = advantages.lambda_returns(data.rewards, taken.mean(-1), continues, cut_off, settings.gamma,
+                                            settings.gae_lambda)
+        explained = 1 - (taken.mean(-1) - targets).square().mean() / targets.var(correction=0).clamp_min(1e-12)
+        self._value_norm.update(targets)
+        chunks = action_chunks(data, inputs, self._value_norm.normalize(targets), settings)
+        batches = self._passes.epochs(network.name, chunks, first_states(states, len(chunks.weights)), self._epochs,
+                                      settings.num_mini_batches, rollout)
+        return Estimate(estimated, [network.training(batches, 'action_value/loss')],
+                        {'action_value/explained_variance': float(explained)})
+
+    def networks(self) -> dict[str, FlatAdam]:
+        return {self._action_value.name: self._action_value.adam}
+
+    def state(self) -> dict[str, Tensor]:
+        """All but the network."""
+        return {'value_norm': self._value_norm.state()}
+
+    def load_state(self, tensors: Mapping[str, Tensor]) -> None:
+        self._value_norm.load_state(tensors['value_norm'])
+
+
+ESTIMATORS = {'dae': DifferenceEstimator, 'coma': CounterfactualEstimator, 'coma_nstep': CounterfactualEstimator}
+
+
+def chunk_length(data: Trajectory, settings: LearnerSettings) -> int:
+    """Steps of a chunk: no more than the rollout has."""
+    return min(settings.chunk_length, data.rewards.numel())
+
+
+def action_chunks(data: Trajectory, inputs: Tensor, targets: Tensor, settings: LearnerSettings) -> ActionChunks:
+    """A rollout cut up for an `ActionNetwork`."""
+    cut = partial(to_chunks, length=chunk_length(data, settings))
+    return ActionChunks(cut(inputs), cut(data.episode_start[:-1]), cut(data.actions), cut(targets),
+                        cut(torch.ones_like(targets)))
