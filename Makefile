@@ -4,6 +4,8 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help build demo test bench bench-peers reproduce lint lock clean
 export PYTHON
+# Those of the named options that have a value, as the program takes them.
+given = $(foreach option,$(1),$(if $($(option)),--$(option) $($(option))))
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
@@ -24,7 +26,7 @@ bench-peers: build  ## compare with BenchMARL, VMAS, JaxMARL and mpe2; ARGS='--j
 	@. scripts/env.sh && exec python -m benchmarks.peers $(ARGS)
 
 reproduce: build  ## train and draw the paper's figures; figure='1b 4' seeds=5 steps=200000 workers=2, ARGS=--list
-	@. scripts/env.sh && exec python -m reproduce $(figure) $(foreach option,seeds steps workers,$(if $($(option)),--$(option) $($(option)))) $(ARGS)
+	@. scripts/env.sh && exec python -m reproduce $(figure) $(call given,seeds steps workers) $(ARGS)
 
 lint: build  ## check the style with ruff
 	@.venv/bin/ruff check $(ARGS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Mapping
 
@@ -83,8 +84,8 @@ class Figure:
     def run(self, team: Team, curve: str, seed: int, steps: int | None = None) -> Run:
         """The run behind one curve and seed; `steps` other than the team's make it a longer one."""
         changes = self.curves[curve]
-        values = {**config.load_task_file(ROOT / 'config' / f'{team.task}.yaml'), **EVERY_RUN, **(SHORT if self.short else {}),
-                  **changes, 'num_agents': team.num_agents, 'seed': seed, 'total_steps': steps or team.steps}
+        values = {**_task_file(team.task), **EVERY_RUN, **(SHORT if self.short else {}), **changes,
+                  'num_agents': team.num_agents, 'seed': seed, 'total_steps': steps or team.steps}
         try:
             settings = config.from_flat(values)
         except SettingsError as error:
@@ -131,6 +132,11 @@ def _resized(figure: Figure, seeds: int | None, steps: int | None, short: bool) 
     if steps:
         teams = [replace(team, steps=steps, first_seed_steps=steps) for team in teams]
     return replace(figure, teams=tuple(teams), short=short)
+
+
+@lru_cache(maxsize=None)
+def _task_file(task: str) -> dict[str, Any]:
+    return config.load_task_file(ROOT / 'config' / f'{task}.yaml')
 
 
 def _text(value: Any) -> str:

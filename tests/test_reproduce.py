@@ -31,7 +31,7 @@ from reproduce.tables import figure_block, replace_block
 ROOT = Path(__file__).parent.parent
 NAMES = ['1b', '2', '4', '5', '7']
 TINY = {'task': 'matrix_game', 'num_agents': 2, 'num_worlds': 2, 'num_steps': 2, 'hidden_size': 8, 'evaluation_episodes': 4,
-        'checkpoint_interval': 2, **figures.EVERY_RUN}
+        'epochs': 1, 'reward_network.epochs': 1, 'checkpoint_interval': 2, **figures.EVERY_RUN}
 DECLARED = '''
 teams: {navigation: {3: {seeds: 2, steps: 6400}, 4: {seeds: 2, steps: 6400}}, line: {3: {seeds: 3, steps: 6400}}}
 curves: {'low': {beta: 0.0}, 'high': {beta: 1.0}}
@@ -116,7 +116,7 @@ def test_a_figure_that_is_not_declared_is_named():
 # Training.
 
 def test_a_killed_run_goes_on_to_the_weights_of_one_that_was_not(tmp_path):
-    long = settings(total_steps=400, checkpoint_interval=10)
+    long = settings(total_steps=400)
     command = [sys.executable, '-m', 'reproduce.run', str(tmp_path / 'killed'), json.dumps(config.flatten(long))]
     process = subprocess.Popen(command, cwd=ROOT)
     deadline = time.monotonic() + 60.0
