@@ -158,6 +158,8 @@ def _figures_of(path: Path) -> list[Figure]:
                 raise SettingsError(f'{origin} names the curve {curve!r}, which is not under curves')
         if parts['baseline'] not in (None, *parts['curves']):
             raise SettingsError(f'{origin} has the baseline {parts["baseline"]!r}, which is none of its curves')
+        if parts['threshold'] is not None and parts['baseline'] is None:
+            raise SettingsError(f'{origin} has a threshold and no baseline to be sooner than')
         if parts['shows'] not in METRICS:
             raise SettingsError(f'{origin} cannot show {parts["shows"]!r}; known are {", ".join(METRICS)}')
         figures.append(Figure(str(name), parts['title'], parts['shows'], {curve: curves[curve] for curve in parts['curves']},

@@ -94,6 +94,7 @@ def test_options_replace_seeds_and_steps():
     ('shows: mean_return', 'shows: speed', "cannot show 'speed'"),
     ('curves: [low, high]', 'curves: [low, higher]', "names the curve 'higher'"),
     ('baseline: low', 'baseline: lowest', "has the baseline 'lowest'"),
+    ('baseline: low, ', '', 'has a threshold and no baseline'),
     ('threshold: 5', 'threshold: five', "threshold must be of type float, not 'five'"),
     ('seeds: 3', 'seeds: 0', 'must be integers of at least 1'),
     ('{3: {seeds: 3, steps: 6400}}', '5', 'teams of line .* must be a mapping, not 5'),
