@@ -264,11 +264,19 @@ def test_biases_begin_at_0_and_layer_norms_as_the_identity(name):
             assert (parameter == (1.0 if scale else 0.0)).all(), path
 
 
-@NETWORKS
-def test_the_parameters_a_table_depends_on_are_the_network_s_first(name):
-    network = begin()[name]
-    for one, other in zip(network.table_parameters(), network.parameters()):
-        assert one is other
+@REWARDS
+@pytest.mark.parametrize(('steps', 'looked_up'), [(12, True), (1, False)])
+def test_the_way_back_of_a_table_by_hand_is_that_of_autograd_to_the_network_s_first_parameters(architecture, steps, looked_up):
+    network = reward_network(architecture).double()
+    with torch.no_grad():
+        network.action_bias.copy_(normal(*network.action_bias.shape))
+    table = network._table(some_actions(steps, 6))
+    assert (table.codes is not None) == looked_up
+    grad = normal(*table.rows.shape, dtype=torch.float64)
+    by_hand = table.gradient(grad)
+    assert len(by_hand) == 4
+    expected = torch.autograd.grad(table.rows, list(network.parameters())[:4], grad)
+    torch.testing.assert_close(list(by_hand), list(expected))
 
 
 def test_the_actor_begins_close_to_uniform():

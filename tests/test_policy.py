@@ -26,13 +26,11 @@ ODD_SIZES = [PolicyArchitecture(*sizes, layers, activation) for sizes in ((18, 5
              for layers in (1, 2, 3) for activation in ('relu', 'tanh')]
 
 
-@pytest.fixture(scope='module', params=[pytest.param('native', marks=native), 'numpy'])
-def either_way(request):
+@pytest.fixture(params=[pytest.param('native', marks=native), 'numpy'])
+def either_way(request, monkeypatch):
     """The test runs with the compiled policy and with that in numpy."""
-    with pytest.MonkeyPatch.context() as patch:
-        if request.param == 'numpy':
-            patch.setattr(library, 'chosen', lambda: None)
-        yield
+    if request.param == 'numpy':
+        monkeypatch.setattr(library, 'chosen', lambda: None)
 
 
 EITHER_WAY = pytest.mark.usefixtures('either_way')
@@ -223,6 +221,13 @@ def test_compiled_a_world_gets_the_same_bits_in_whatever_batch_it_is(policy, wor
     among = data.draw(strategies.lists(strategies.integers(0, worlds - 1), min_size=1, max_size=130))
     for part, whole in parts_of_batches(policy, worlds, seed, [among, among[:1]]):
         assert part.tobytes() == whole.tobytes()
+
+
+@native
+def test_a_policy_deeper_than_the_kernels_take_is_refused():
+    with pytest.raises(ValueError, match='13 layers are more than a policy may have'):
+        random_policy(SIZES._replace(mlp_layers=13))
+    assert_equal_to_rounding(SIZES._replace(mlp_layers=12))
 
 
 @native

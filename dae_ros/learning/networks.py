@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Iterable
+from typing import Callable, Iterable, NamedTuple, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -79,6 +79,15 @@ def run_in_torch(steps: Iterable[Step], batch: Batch) -> tuple[Tensor, Tensor | 
     return x, states
 
 
+class Table(NamedTuple):
+    """What a fan-out adds: `Batch.table` and `Batch.codes`, and the way back to the parameters they depend on."""
+
+    rows: Tensor | None
+    codes: Tensor | None
+    # From the gradient of `rows`, those of the network's first parameters, by hand: autograd takes three times as long.
+    gradient: Callable[[Tensor], Sequence[Tensor]]
+
+
 class Network(nn.Module):
     """What all networks share: outputs, and the gradient of a loss of them."""
 
@@ -93,13 +102,9 @@ class Network(nn.Module):
         """Parameters and steps, collected once: a thousand gradients a second need them."""
         return tuple(self.parameters()), self.steps()
 
-    def table_parameters(self) -> tuple[Tensor, ...]:
-        """The parameters `_table` depends on; they are the network's first."""
-        return ()
-
-    def _table(self, actions: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """What a fan-out adds, and which row of it each agent has: `Batch.table` and `Batch.codes`."""
-        return None, None
+    def _table(self, actions: Tensor | None) -> Table:
+        """What a fan-out adds."""
+        return Table(None, None, lambda grad: ())
 
     def forward(self, inputs: Tensor, initial: Tensor, episode_start: Tensor,
                 actions: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -109,7 +114,7 @@ class Network(nn.Module):
         for networks that see them. With gradients enabled this is torch; see `gradient`.
         """
         _, steps = self._own
-        batch = Batch(inputs, initial, episode_start, _agents(inputs, actions), *self._table(actions))
+        batch = _batch(inputs, initial, episode_start, actions, self._table(actions))
         if kernels.usable(inputs) and not torch.is_grad_enabled():
             return kernels.forward(steps, batch)
         return run_in_torch(steps, batch)
@@ -121,21 +126,21 @@ class Network(nn.Module):
         Leaves no trace on the parameters, so that threads may share the network.
         """
         parameters, steps = self._own
-        with torch.enable_grad():
-            table, codes = self._table(actions)
-            batch = Batch(inputs, initial, episode_start, _agents(inputs, actions), table, codes)
-            if not kernels.usable(inputs):
+        with torch.set_grad_enabled(not kernels.usable(inputs)):
+            table = self._table(actions)
+            batch = _batch(inputs, initial, episode_start, actions, table)
+            if torch.is_grad_enabled():
                 objective, sums = loss(run_in_torch(steps, batch)[0])
                 return torch.cat([part.reshape(-1) for part in torch.autograd.grad(objective, parameters)]), sums
-        flat, grad_table, sums = kernels.gradient(steps, parameters, batch, loss.terms)
-        if table is not None:
-            parts = [part.reshape(-1) for part in torch.autograd.grad(table, self.table_parameters(), grad_table)]
-            torch.cat(parts, out=flat[:sum(map(len, parts))])
+            flat, grad_table, sums = kernels.gradient(steps, parameters, batch, loss.terms)
+            parts = [part.reshape(-1) for part in table.gradient(grad_table)]
+            if parts:
+                torch.cat(parts, out=flat[:sum(map(len, parts))])
         return flat, sums[:len(loss.sums)]
 
 
-def _agents(inputs: Tensor, actions: Tensor | None) -> int:
-    return inputs.shape[2] if actions is None else actions.shape[2]
+def _batch(inputs: Tensor, initial: Tensor, episode_start: Tensor, actions: Tensor | None, table: Table) -> Batch:
+    return Batch(inputs, initial, episode_start, (inputs if actions is None else actions).shape[2], table.rows, table.codes)
 
 
 class RecurrentNetwork(Network):
@@ -173,6 +178,11 @@ def _joint_actions_of_others(num_agents: int, num_actions: int, device: torch.de
     return torch.cat(blocks), torch.stack(place, 1).float(), torch.arange(N, device=device) * len(digits)
 
 
+def _of_others(x: Tensor) -> Tensor:
+    """Sums over the other agents [L C N, H], for x [L, C, N, H]."""
+    return (x.sum(-2, keepdim=True) - x).flatten(0, 2)
+
+
 class RewardNetwork(Network):
     """r_psi(s, a_-i, .): for every agent the shared reward for each action of its own (paper, section 3.3).
 
@@ -197,21 +207,30 @@ class RewardNetwork(Network):
         """Recurrent states per world: N or 1."""
         raise NotImplementedError
 
-    def table_parameters(self) -> tuple[Tensor, ...]:
-        return self.action_embedding, self.action_bias, self.joint_action.weight, self.joint_action.bias
-
-    def _table(self, actions: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _table(self, actions: Tensor) -> Table:
         """joint_action(relu(embedding of the others' actions)) for actions [L, C, N]."""
         N, A = self.num_agents, self.num_actions
-        codes = None
         if N * A ** (N - 1) <= _LOOK_UP_BELOW * actions.numel():
             hot, place, first = _joint_actions_of_others(N, A, actions.device)
-            others = hot.to(self.action_bias.dtype) @ self.action_embedding
-            codes = (actions.float() @ place).long() + first
+            hot = hot.to(self.action_bias.dtype)
+            others, codes = hot @ self.action_embedding, (actions.float() @ place).long() + first
+
+            def to_embedding(grad: Tensor) -> Tensor:
+                return hot.t() @ grad
         else:
-            embedded = functional.embedding(actions + torch.arange(N, device=actions.device) * A, self.action_embedding)
-            others = (embedded.sum(-2, keepdim=True) - embedded).flatten(0, 2)
-        return self.joint_action(torch.relu(others + self.action_bias)), codes
+            taken = actions + torch.arange(N, device=actions.device) * A
+            others, codes = _of_others(functional.embedding(taken, self.action_embedding)), None
+
+            def to_embedding(grad: Tensor) -> Tensor:
+                to_each = _of_others(grad.view(*taken.shape, grad.shape[-1]))
+                return torch.zeros_like(self.action_embedding).index_add_(0, taken.flatten(), to_each)
+        hidden = torch.relu(others + self.action_bias)
+
+        def gradient(grad: Tensor) -> Sequence[Tensor]:
+            to_hidden = (grad @ self.joint_action.weight).mul_(hidden > 0)
+            return to_embedding(to_hidden), to_hidden.sum(0), grad.t() @ hidden, grad.sum(0)
+
+        return Table(self.joint_action(hidden), codes, gradient)
 
 
 class PerAgentRewardNetwork(RewardNetwork):

@@ -102,7 +102,10 @@ class _Compiled:
         head = step('layer', 'identity', H, A, 'head.weight', 'head.bias', None, None)
         row = [norm(O, 'input_norm'), *mlp, gru, norm(H, 'gru_norm'), head]
         steps = (library.CStep * len(row))(*row)
-        packed = np.empty(compiled.policy_pack(steps, len(row), None), np.uint8)
+        size = compiled.policy_pack(steps, len(row), None)
+        if size == 0:  # weights come from outside, too
+            raise ValueError(f'{mlp_layers} layers are more than a policy may have')
+        packed = np.empty(size, np.uint8)
         compiled.policy_pack(steps, len(row), packed.ctypes.data)
         self._kept = tensors, steps, packed  # what lies at the addresses below
         self._network = ctypes.addressof(steps), len(row), packed.ctypes.data

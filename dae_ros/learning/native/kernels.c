@@ -1171,8 +1171,10 @@ static void softmax(long rows, long A, float *scores) {
 static void *aligned(void *memory) { return (void *)(((uintptr_t)memory + 63) & ~(uintptr_t)63); }
 
 /* Packs the weights of a policy, whose steps are layers and a GRU, into `memory` unless this is NULL. Returns how many
- * bytes that needs. */
+ * bytes that needs; 0 for more steps than a network may have. */
 long policy_pack(const Step *steps, long count, void *memory) {
+    if (count > MOST_STEPS)
+        return 0;
     Work works[MOST_STEPS] = {0};
     Arena arena = {aligned(memory), 0};
     plan_weights(&arena, steps, count, 0, works);
