@@ -45,7 +45,7 @@ class Learner:
         architecture = PolicyArchitecture(self._spec.observation_size, self._spec.num_actions, settings.hidden_size,
                                           settings.mlp_layers, settings.activation)
         named = dict(self._actor.network.named_parameters())
-        return Policy(architecture, {name: named[name].detach().cpu().numpy().copy() for name in architecture.shapes()})
+        return Policy(architecture, {name: named[name].detach().cpu().numpy() for name in architecture.shapes()})
 
     def update(self, trajectory: Trajectory, rollout: int) -> dict[str, float]:
         """Learn from one rollout. Returns the metrics of the update, by name."""
