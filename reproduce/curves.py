@@ -11,13 +11,16 @@ import numpy as np
 
 from dae_ros.files import write_atomically
 from dae_ros.report.metrics import STEPS
-from reproduce.figures import Figure, Run, Team
+from reproduce.figures import SECONDS, Figure, Run, Team
 from reproduce.records import Records
 from reproduce.statistics import binned, mean_and_interval
 
 POINTS = 100  # bins of a run, at least; at most twice as many
+SPENT = ('seconds/collecting', 'seconds/learning')
 COLUMNS = {'mean_return': 'mean_return', 'advantage/deviation': 'advantage_deviation',
-           'reward_network/explained_variance': 'reward_explained_variance', 'policy/entropy': 'policy_entropy'}
+           'reward_network/explained_variance': 'reward_explained_variance', 'policy/entropy': 'policy_entropy',
+           'expected_reward/explained': 'expected_reward_explained', 'credit/explained': 'credit_explained', SECONDS: 'seconds'}
+PROBED = {'expected_reward/explained': 'explained', 'credit/explained': 'credit_explained'}  # in what the runs log of it
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Seed:
 class Band:
     """A curve with its interval: all [bins]."""
 
-    steps: np.ndarray
+    steps: np.ndarray  # or what else the figure shows it against
     mean: np.ndarray
     half: np.ndarray  # of the interval's width; nan where there is none
 
@@ -69,6 +72,8 @@ class Curves:
         groups = [self.seeds[team, curve] for team in teams]
         bins = min(len(seed.steps) for group in groups for seed in group)
         mean, half = mean_and_interval([np.array([seed.metrics[metric][:bins] for seed in group]) for group in groups])
+        if self.figure.against == SECONDS:
+            return Band(np.mean([seed.metrics[SECONDS][:bins] for group in groups for seed in group], axis=0), mean, half)
         return Band(groups[0][0].steps[:bins], mean, half)
 
     def write_csv(self, path: Path) -> None:
@@ -93,5 +98,12 @@ def _seed(run: Run, width: int, records: Records) -> Seed:
     rows = len(columns[STEPS])
     missing = np.full(rows, np.nan)  # a run without reward networks has no metrics of them
     metrics = {metric: binned(columns.get(metric, missing), width) for metric in COLUMNS}
-    bins = len(metrics['mean_return'])
-    return Seed(run, columns[STEPS][np.arange(1, bins + 1) * min(width, rows) - 1], metrics)
+    ends = np.arange(1, len(metrics['mean_return']) + 1) * min(width, rows)
+    steps = columns[STEPS][ends - 1]
+    # The usual time of an update: what else the machine did now and then must not move the curve.
+    metrics[SECONDS] = ends * np.median(sum(columns[part] for part in SPENT))
+    credit = records.credit(run)
+    for metric, name in PROBED.items():
+        if credit:
+            metrics[metric] = np.interp(steps, credit[STEPS], credit[name])
+    return Seed(run, steps, metrics)

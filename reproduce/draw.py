@@ -13,10 +13,12 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
 from dae_ros.config import TaskSettings
+from dae_ros.report.metrics import STEPS
 from dae_ros.report.style import FAINT, GREY, INK, ROBOTS, compact, plain
 from dae_ros.worlds.yardsticks import yardstick_returns
 from reproduce.curves import Curves
 from reproduce.figures import METRICS, Team
+from reproduce.statistics import last
 
 YARDSTICKS = ('random', 'greedy', 'best')
 YARDSTICK_EPISODES = 1000
@@ -36,7 +38,7 @@ def draw(curves: Curves, path: Path) -> None:
         for teams, axes, task in zip(row, places, figure.tasks if figure.average else [figure.tasks[number]] * columns):
             _panel(axes, curves, task, teams)
     canvas.supylabel(METRICS[figure.shows], fontsize=9, color=INK)
-    canvas.supxlabel('environment steps', fontsize=9, color=INK)
+    canvas.supxlabel(METRICS[figure.against], fontsize=9, color=INK)
     handles = {}
     for axes in panels.flat:
         handles |= {text: line for line, text in zip(*axes.get_legend_handles_labels())}
@@ -51,7 +53,8 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     figure = curves.figure
     plain(axes)
     axes.grid(axis='y', color=FAINT, linewidth=0.6)
-    axes.xaxis.set_major_formatter(compact)
+    if not figure.scattered:
+        axes.xaxis.set_major_formatter(compact)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     sizes = ', '.join(str(team.num_agents) for team in teams)
     longer = {curve: curves.longer[teams[0], curve] for curve in figure.curves} if len(teams) == 1 else {}
@@ -59,11 +62,14 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     axes.set_title(f'{task}, N = {sizes or "none yet"}   {_seeds(curves, teams)}{alone}', loc='left', fontsize=9, color=INK)
     if figure.shows == 'mean_return' and teams:
         _yardsticks(axes, curves, teams)
+    if figure.scattered:
+        _points(axes, curves, teams)
+        return
     bands = {curve: band for curve in figure.curves if (band := curves.band(teams, curve, figure.shows)) is not None}
     for curve, band in bands.items():
         colour = _colour(curves, curve)
         axes.plot(band.steps, band.mean, color=colour, linewidth=1.5, label=curve)
-        if (seed := longer.get(curve)) is not None:
+        if figure.against == STEPS and (seed := longer.get(curve)) is not None:
             beyond = seed.steps >= band.steps[-1]
             axes.plot(seed.steps[beyond], seed.metrics[figure.shows][beyond], color=colour, linewidth=0.8, alpha=0.8)
     axes.margins(y=0.1)
@@ -72,6 +78,16 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
         axes.fill_between(band.steps, band.mean - band.half, band.mean + band.half, color=_colour(curves, curve), alpha=0.2,
                           linewidth=0)
     axes.set_ylim(limits)  # of two seeds the interval can be wider than everything else there is to see
+
+
+def _points(axes: Axes, curves: Curves, teams: Sequence[Team]) -> None:
+    """Where every seed ended."""
+    figure = curves.figure
+    for curve in figure.curves:
+        ends = [[last(seed.metrics[metric]) for metric in (figure.against, figure.shows)]
+                for team in teams for seed in curves.seeds[team, curve]]
+        if ends:
+            axes.scatter(*zip(*ends), color=_colour(curves, curve), s=18, label=curve)
 
 
 def _colour(curves: Curves, curve: str) -> str:

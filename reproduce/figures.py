@@ -13,11 +13,16 @@ from benchmarks.machine import ROOT
 from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.errors import SettingsError
+from dae_ros.report.metrics import STEPS
 
 FOLDER = ROOT / 'config' / 'figures'
 # One thread each: side by side, runs use the cores better than a learner's threads do.
 EVERY_RUN = {'device': 'cpu', 'learner_threads': 1}
-METRICS = {'mean_return': 'mean return of an episode', 'advantage/deviation': 'standard deviation of the advantages'}
+SECONDS = 'seconds'
+METRICS = {'mean_return': 'mean return of an episode', 'advantage/deviation': 'standard deviation of the advantages',
+           'reward_network/explained_variance': 'variance of the reward explained',
+           'expected_reward/explained': 'variance of E[r] explained', 'credit/explained': 'credit explained',
+           STEPS: 'environment steps', SECONDS: 'seconds of training, in one thread'}
 SHORT_STEPS = 200  # of each run
 SHORT = {'num_worlds': 4, 'epochs': 1, 'reward_network.epochs': 1, 'evaluation_episodes': 8}
 
@@ -67,11 +72,17 @@ class Figure:
     shows: str                           # the metric
     curves: Mapping[str, Mapping[str, Any]]  # settings that differ from the task file, by the curve's name
     teams: tuple[Team, ...]
+    against: str                         # STEPS, or a metric: 'seconds' is an axis like steps, others give a point a seed
     average: bool                        # over the team sizes of a task
     threshold: float | None
     baseline: str | None
     palette: tuple[str, ...]             # all curves of the file, so that a curve has one colour in all its figures
     short: bool
+
+    @property
+    def scattered(self) -> bool:
+        """Whether every seed is one point, of where its training ended."""
+        return self.against not in (STEPS, SECONDS)
 
     @property
     def tasks(self) -> list[str]:
@@ -152,7 +163,7 @@ def _figures_of(path: Path) -> list[Figure]:
     for name, declared in content['figures'].items():
         origin = f'figure {name} in {path}'
         parts = _fields(_mapping(declared, origin), origin, {'title': str, 'shows': str, 'curves': list},
-                        {'average': bool, 'threshold': float, 'baseline': str})
+                        {'against': str, 'average': bool, 'threshold': float, 'baseline': str})
         for curve in parts['curves']:
             if curve not in curves:
                 raise SettingsError(f'{origin} names the curve {curve!r}, which is not under curves')
@@ -160,10 +171,12 @@ def _figures_of(path: Path) -> list[Figure]:
             raise SettingsError(f'{origin} has the baseline {parts["baseline"]!r}, which is none of its curves')
         if parts['threshold'] is not None and parts['baseline'] is None:
             raise SettingsError(f'{origin} has a threshold and no baseline to be sooner than')
-        if parts['shows'] not in METRICS:
-            raise SettingsError(f'{origin} cannot show {parts["shows"]!r}; known are {", ".join(METRICS)}')
+        against = parts['against'] or STEPS
+        for metric in (parts['shows'], against):
+            if metric not in METRICS:
+                raise SettingsError(f'{origin} cannot show {metric!r}; known are {", ".join(METRICS)}')
         figures.append(Figure(str(name), parts['title'], parts['shows'], {curve: curves[curve] for curve in parts['curves']},
-                              teams, bool(parts['average']), parts['threshold'], parts['baseline'], tuple(curves),
+                              teams, against, bool(parts['average']), parts['threshold'], parts['baseline'], tuple(curves),
                               short=False))
     return figures
 

@@ -52,6 +52,11 @@ class Records:
         kept = columns[STEPS] <= run.steps
         return {name: values[kept] for name, values in columns.items()}
 
+    def credit(self, run: Run) -> dict[str, np.ndarray]:
+        """Columns of what was measured of its credit, [rows] by name; none where it learns no reward."""
+        file = self.path(run) / 'credit' / 'metrics.csv'
+        return read_metrics(file) if file.exists() else {}
+
     def progress(self, name: str) -> tuple[int, float]:
         """Environment steps behind the run of this name, and the mean return of its newest rollout."""
         file = self.folder / name / 'metrics.csv'

@@ -10,6 +10,7 @@ from scipy.stats import t as student
 from dae_ros.report.learning_curve import smoothed
 
 CONFIDENCE = 0.95
+END_SHARE = 0.05  # of a training, over which its last return is averaged
 
 
 def mean_and_interval(groups: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -46,3 +47,8 @@ def steps_to_reach(threshold: float, steps: np.ndarray, values: np.ndarray) -> f
     """The first of `steps` [rows] at which `values` [rows], smoothed, are at the threshold or above; None if they never are."""
     reached = np.flatnonzero(smoothed(values) >= threshold)
     return float(steps[reached[0]]) if len(reached) else None
+
+
+def last(values: np.ndarray) -> float:
+    """Mean over the last part of a training."""
+    return float(np.mean(values[-max(1, round(END_SHARE * len(values))):]))

@@ -15,9 +15,8 @@ from dae_ros.report.style import signed
 from reproduce.curves import Curves, Seed
 from reproduce.figures import METRICS, Team
 from reproduce.records import Records
-from reproduce.statistics import mean_and_interval, steps_to_reach
+from reproduce.statistics import last, mean_and_interval, steps_to_reach
 
-END_SHARE = 0.05  # of a training, over which its last return is averaged
 HEADER = '''# Results
 
 The paper's figures, trained and drawn again by `make reproduce`. Lines and numbers are means over seeds, bands and ± their
@@ -125,11 +124,6 @@ def _pairs(curves: Curves, team: Team, curve: str) -> np.ndarray:
     ours, theirs = ({seed.run.seed: last(seed.metrics[curves.figure.shows]) for seed in curves.seeds[team, name]}
                     for name in (curve, curves.figure.baseline))
     return np.array([ours[seed] - theirs[seed] for seed in ours if seed in theirs])
-
-
-def last(values: np.ndarray) -> float:
-    """Mean over the last part of a training."""
-    return float(np.mean(values[-max(1, round(END_SHARE * len(values))):]))
 
 
 def _interval(groups: Sequence[Sequence[Seed]], value) -> tuple[float, float]:
