@@ -15,6 +15,7 @@ from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.files import write_atomically
 from dae_ros.learning.distributed import make_learner
+from dae_ros.learning.estimators import ExpectedRewards
 from dae_ros.learning.policy import Policy
 from dae_ros.report.metrics import MetricsLog
 from dae_ros.run_folder import RunFolder
@@ -37,14 +38,15 @@ def episode_returns(trajectory: Trajectory) -> np.ndarray:
 class Training:
     """The state of a run between rollouts. Resumes from the folder's newest checkpoint if there is one."""
 
-    def __init__(self, settings: Settings, spec: WorldSpec, folder: RunFolder):
+    def __init__(self, settings: Settings, spec: WorldSpec, folder: RunFolder, exact_rewards: ExpectedRewards | None = None):
+        """`exact_rewards`: as for `Learner`."""
         self.settings = settings
         self.spec = spec
         self.run = folder.run
         self.mean_return = math.nan
         self.evaluation: np.ndarray = np.empty(0)
         self._folder = folder
-        self._learner = make_learner(spec, settings)
+        self._learner = make_learner(spec, settings, exact_rewards)
         self._steps_per_rollout = settings.task.num_worlds * settings.run.num_steps
         self._training_rollouts = -(-settings.run.total_steps // self._steps_per_rollout)
         self._rollout = 0
