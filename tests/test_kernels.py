@@ -290,6 +290,23 @@ def test_table_of_the_others_actions_gives_what_each_agent_sees(architecture, N,
     torch.testing.assert_close(results(network, batch, loss), with_table)
 
 
+@ARCHITECTURES
+def test_parts_that_share_a_table_have_gradients_that_add_up_to_that_of_the_whole(architecture):
+    network, batch = reward_network(architecture, 3, 5, 50)
+    loss = reward_loss(network(*batch)[0].detach())
+    with torch.no_grad():
+        table = network.shared_table(batch.actions)
+        assert network.shared_table(batch.actions[:, :8]) is None
+
+    def of(columns):
+        cut = changed(batch, lambda x: x[:, columns])._replace(initial=batch.initial[columns])
+        return network.gradient(changed(loss, lambda x: x[:, columns]), *cut, shared=table)[0]
+
+    found = table.to_parameters(of(slice(0, 8)) + of(slice(8, 8)) + of(slice(8, 50)))
+    whole = network.gradient(loss, *batch)[0]
+    torch.testing.assert_close(found, whole, rtol=1e-4, atol=1e-5 * float(whole.abs().max()))
+
+
 def examples():
     """(network, batch, loss) of all kinds, each of several blocks and of odd sizes."""
     made = [(*actor(), policy_loss), (*recurrent_network('tanh', 1, 11, 101, 1, 1), value_loss)]

@@ -210,8 +210,8 @@ class RewardNetwork(Network):
     """r_psi(s, a_-i, .): for every agent the shared reward for each action of its own (paper, section 3.3).
 
     The zeroed block of agent i's own action is the only thing that tells the agents apart, so what depends on the others'
-    actions alone is computed once for all they can do, where that is less than the batch (75 rows for three agents with
-    five actions).
+    actions alone is computed once a gradient step for all they can do, where that is less than half of what they did (75
+    rows for three agents with five actions).
     """
 
     def __init__(self, spec: WorldSpec, settings: RewardNetworkSettings):
@@ -232,12 +232,12 @@ class RewardNetwork(Network):
 
     def shared_table(self, actions: Tensor) -> Table | None:
         """What the parts of a batch with actions [L, C, N] can share: joint_action(relu(embedding)) of everything the others
-        can do. None if that is no less than what they did."""
+        can do. None if that is more than half of what they did."""
         N, A = self.num_agents, self.num_actions
         if N * A ** (N - 1) > _LOOK_UP_BELOW * actions.numel():
             return None
         hot = _joint_actions_of_others(N, A, actions.device)[0].to(self.action_bias.dtype)
-        return self._table_of(hot @ self.action_embedding, lambda grad: hot.t() @ grad)
+        return self._table_of(torch.addmm(self.action_bias, hot, self.action_embedding), lambda grad: hot.t() @ grad)
 
     def _table(self, actions: Tensor, shared: Table | None) -> Table:
         N, A = self.num_agents, self.num_actions
@@ -251,11 +251,12 @@ class RewardNetwork(Network):
             to_each = _of_others(grad.view(*taken.shape, grad.shape[-1]))
             return torch.zeros_like(self.action_embedding).index_add_(0, taken.flatten(), to_each)
 
-        return self._table_of(_of_others(functional.embedding(taken, self.action_embedding)), to_embedding)
+        others = _of_others(functional.embedding(taken, self.action_embedding))
+        return self._table_of(others + self.action_bias, to_embedding)
 
     def _table_of(self, others: Tensor, to_embedding: Callable[[Tensor], Tensor]) -> Table:
-        """joint_action(relu(the others' embedding + bias)); `to_embedding` takes the gradient of `others` further back."""
-        hidden = torch.relu(others + self.action_bias)
+        """joint_action(relu(others)), the others' embedding and the bias; `to_embedding` takes the gradient of `others` back."""
+        hidden = torch.relu(others)
 
         def gradient(grad: Tensor) -> Sequence[Tensor]:
             to_hidden = torch.ops.aten.threshold_backward(grad @ self.joint_action.weight, hidden, 0)  # relu's

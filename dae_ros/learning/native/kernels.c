@@ -797,15 +797,26 @@ static void layer_backward(const Step *step, const Work *work, const float *x, c
     }
 }
 
+/* Rows of a table lie anywhere in it: the processor is told of each AHEAD rows before it is used. */
+enum { AHEAD = 4 };
+
+INLINE void prefetch_row(const float *row, long O) {
+    for (long j = 0; j < O; j += 16)
+        __builtin_prefetch(row + j);
+}
+
 /* y[row] = LayerNorm(relu(table[code of row] + x[row / N])). */
 static void fan_out_forward(const Step *step, const Work *work, long N, const float *table, const int64_t *codes,
                             const float *x) {
     const long O = step->outputs;
     for (long first = 0; first < work->count; first += BLOCK) {
         const long end = min(first + BLOCK, work->count);
-        for (long row = first; row < end; row++)
+        for (long row = first; row < end; row++) {
+            if (row + AHEAD < work->count)
+                prefetch_row(table + codes[row + AHEAD] * O, O);
             activate_row(O, RELU, table + codes[row] * O, x + row / N * O, work->activated + row * O,
                          work->statistics + 2 * row);
+        }
         normalise(end - first, O, work->activated + first * O, step->parameters[2], step->parameters[3],
                   work->statistics + 2 * first, work->y + first * O);
     }
@@ -825,6 +836,8 @@ static void fan_out_backward(const Step *step, const Work *work, long N, const f
                            grad_y + first * O, step->gradients[2], step->gradients[3], means);
         for (long row = first; row < end; row++) {
             float *to = grad_table + codes[row] * O, *grad = s->layer_gradient;
+            if (row + AHEAD < work->count)
+                prefetch_row(grad_table + codes[row + AHEAD] * O, O);
             row_backward(O, RELU, work->activated + row * O, work->statistics + 2 * row, means + 2 * (row - first), scale,
                          grad_y + row * O, grad, grad_x ? grad_x + row / N * O : NULL);
             FOR_EACH_VECTOR(O, { add_to(to + j, load_upto(grad + j, lanes), lanes); });
