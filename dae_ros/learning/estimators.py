@@ -16,7 +16,7 @@ from torch import Tensor
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.learning import advantages, losses
 from dae_ros.learning.chunks import ActionChunks, ValueChunks, first_states, to_chunks
-from dae_ros.learning.networks import RewardNetwork, make_action_value_network, make_critic, make_reward_network
+from dae_ros.learning.networks import RewardNetwork, Table, make_action_value_network, make_critic, make_reward_network
 from dae_ros.learning.optimizer import FlatAdam
 from dae_ros.learning.parallel import Training
 from dae_ros.learning.passes import Batch, Passes
@@ -56,11 +56,15 @@ class ActionNetwork:
         """Gradient steps of half the squared error on batches of `ActionChunks`."""
         network = self.adam.network
 
-        def gradient(shard: ActionChunks, initial: Tensor) -> tuple[Tensor, Tensor]:
+        def gradient(shard: ActionChunks, initial: Tensor, shared: Table | None = None) -> tuple[Tensor, Tensor]:
             loss = losses.RewardLoss(shard.actions, shard.targets, shard.weights / network.num_agents)
-            return network.gradient(loss, shard.inputs, initial, shard.episode_start, shard.actions)
+            return network.gradient(loss, shard.inputs, initial, shard.episode_start, shard.actions, shared)
 
-        return self._passes.train(self.name, self.adam, gradient, batches, network.num_agents, (loss_name,))
+        @torch.no_grad()
+        def shared(chunks: ActionChunks) -> Table | None:
+            return network.shared_table(chunks.actions)
+
+        return self._passes.train(self.name, self.adam, gradient, batches, network.num_agents, (loss_name,), shared)
 
 
 class DifferenceEstimator:
