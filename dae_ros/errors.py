@@ -19,6 +19,10 @@ class WorldError(DaeRosError):
     """A task cannot be simulated as asked."""
 
 
+class FileError(DaeRosError):
+    """A file cannot be written: the disk is full, or it may not be."""
+
+
 class RunFolderError(DaeRosError):
     """A run's folder cannot be used: it holds another run, or cannot be written."""
 

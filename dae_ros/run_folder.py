@@ -11,7 +11,7 @@ import numpy as np
 from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.errors import Refused, RunFolderError
-from dae_ros.files import write_atomically
+from dae_ros.files import remove_unfinished, write_atomically
 from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint
 
 
@@ -26,6 +26,7 @@ class RunFolder:
         self.path = path
         self.run = _identity(settings, path)
         self._keep = settings.run.keep_checkpoints
+        self._keep_every = settings.run.keep_every
         text = config.to_yaml(settings)
         try:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
@@ -63,14 +64,29 @@ class RunFolder:
     def summary_file(self) -> Path:
         return self.path / 'summary.json'
 
+    def next_attempt(self) -> int:
+        """A number greater than all this gave before, from 0, also after a restart: on disk before it is returned."""
+        file = self.path / 'attempts'
+        try:
+            attempt = int(file.read_text(encoding='ascii')) if file.exists() else 0
+        except ValueError as error:
+            raise RunFolderError(f'{file} should hold the number of attempts; stop all nodes of the run and delete it') from error
+        write_atomically(file, f'{attempt + 1}\n'.encode())
+        return attempt
+
     def save_checkpoint(self, update: int, tensors: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
         """Writes the checkpoint after `update` updates and deletes the oldest beyond those kept."""
         write_atomically(self._checkpoint(update), encode_checkpoint(tensors, facts))
         for old in self._updates()[:-self._keep]:
-            self._checkpoint(old).unlink(missing_ok=True)
+            if not self._keep_every or old % self._keep_every:
+                self._checkpoint(old).unlink(missing_ok=True)
 
     def newest_checkpoint(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
-        """Tensors and facts of the newest whole checkpoint; torn or corrupted ones are passed over."""
+        """Tensors and facts of the newest whole checkpoint; torn or corrupted ones are passed over.
+
+        For the run's one trainer: what an earlier one left half written is removed.
+        """
+        remove_unfinished(self.checkpoints)
         for update in reversed(self._updates()):
             try:
                 return decode_checkpoint(self._checkpoint(update).read_bytes())

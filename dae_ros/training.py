@@ -48,7 +48,8 @@ class Training:
         self._steps_per_rollout = settings.task.num_worlds * settings.run.num_steps
         self._training_rollouts = -(-settings.run.total_steps // self._steps_per_rollout)
         self._rollout = 0
-        self._attempt = 0
+        self._attempt = folder.next_attempt()
+        self._asked: int | None = None  # the rollout asked for last
         self._updates = 0
         self._seconds_before = 0.0
         resumed = folder.newest_checkpoint()
@@ -98,12 +99,14 @@ class Training:
 
     def request(self) -> RolloutRequest:
         """The rollout wanted now. Asking again without consuming begins it anew: the next attempt."""
+        if self._asked == self._rollout:
+            self._attempt = self._folder.next_attempt()
+        self._asked = self._rollout
         now = time.monotonic()
         self._began_at = self._began_at or now
         self._rollout_began_at = now
         request = RolloutRequest(self.run, self._rollout, self._attempt, self.policy_version, self.settings.run.seed,
                                  self.settings.run.num_steps, self.evaluating and self.settings.run.evaluation_greedy)
-        self._attempt += 1
         return request
 
     def consume(self, trajectory: Trajectory) -> None:
@@ -115,7 +118,6 @@ class Training:
             self.mean_return = float(returns.mean()) if len(returns) else math.nan
             self._learn(trajectory)
         self._rollout += 1
-        self._attempt = 0
 
     def save(self) -> None:
         """Writes a checkpoint of the training as it stands."""

@@ -9,7 +9,7 @@ import pytest
 
 from dae_ros import config
 from dae_ros.config import Settings
-from dae_ros.errors import RunFolderError
+from dae_ros.errors import FileError, RunFolderError
 from dae_ros.run_folder import RunFolder
 
 SETTINGS = config.from_flat({'keep_checkpoints': 3, 'beta': 0.5})
@@ -111,6 +111,31 @@ def test_the_newest_checkpoints_are_kept_and_older_ones_deleted(tmp_path, keep):
     assert newest_update(folder) is None
 
 
+def test_every_so_often_a_checkpoint_is_kept_for_good(tmp_path):
+    folder = folder_with(tmp_path, range(1, 12), config.from_flat({'keep_checkpoints': 2, 'keep_every': 4}))
+    assert sorted(int(path.stem[11:]) for path in folder.checkpoints.iterdir()) == [4, 8, 10, 11]
+
+
+def test_an_attempt_is_given_once_also_when_the_folder_is_opened_again(tmp_path):
+    given = [RunFolder(tmp_path, SETTINGS).next_attempt() for _ in range(3)]
+    folder = RunFolder(tmp_path, SETTINGS)
+    assert [*given, folder.next_attempt(), folder.next_attempt()] == [0, 1, 2, 3, 4]
+
+
+def test_a_number_of_attempts_that_cannot_be_read_is_an_error_that_names_its_file(tmp_path):
+    folder = RunFolder(tmp_path, SETTINGS)
+    (tmp_path / 'attempts').write_text('many')
+    with pytest.raises(RunFolderError, match=f'^{tmp_path}/attempts should hold the number of attempts'):
+        folder.next_attempt()
+
+
+def test_what_a_killed_trainer_left_half_written_is_removed_by_the_next(tmp_path):
+    folder = folder_with(tmp_path, [1])
+    (folder.checkpoints / '.checkpoint_00000002.safetensors.12.part').write_bytes(b'half')
+    assert newest_update(folder) == 1
+    assert len(list(folder.checkpoints.iterdir())) == 1
+
+
 def test_checkpoints_are_ordered_by_number_however_many_digits_they_have(tmp_path):
     folder = folder_with(tmp_path, [9, 99_999_999, 100_000_000])
     assert newest_update(folder) == 100_000_000
@@ -144,8 +169,9 @@ def test_a_write_that_is_cut_short_leaves_the_checkpoints_there_were(tmp_path, m
         with monkeypatch.context() as patch:
             patch.setattr(step, fail)
             for update in (2, 3):
-                with pytest.raises(OSError, match='no space left'):
+                with pytest.raises(FileError, match=f'^cannot write .*_0000000{update}.safetensors: no space left'):
                     folder.save_checkpoint(update, tensors(9), {'updates': 9})
+        assert len(list(folder.checkpoints.iterdir())) == 2
         assert newest_update(RunFolder(tmp_path, SETTINGS)) == 2
 
 

@@ -185,7 +185,15 @@ def test_a_rollout_asked_for_twice_is_the_next_attempt_of_the_same_rollout(begin
     assert first == second._replace(attempt=0) == third._replace(attempt=0)
     assert run.collect().attempt == 3
     request = run.training.request()
-    assert (request.rollout, request.attempt, request.policy_version) == (1, 0, 1)
+    assert (request.rollout, request.attempt, request.policy_version) == (1, 3, 1)
+
+
+def test_a_training_that_comes_back_at_an_earlier_rollout_supersedes_what_it_asked_for_before(begin):
+    killed = begin(NAVIGATION, 'disturbed').train(stop_after=3)
+    before = killed.training.request()
+    after = begin(NAVIGATION, 'disturbed').training.request()
+    assert (before.rollout, after.rollout) == (3, 2)
+    assert after.order > before.order
 
 
 @pytest.mark.parametrize('greedy', [True, False])
