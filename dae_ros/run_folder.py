@@ -64,6 +64,11 @@ class RunFolder:
     def summary_file(self) -> Path:
         return self.path / 'summary.json'
 
+    def remove_unfinished(self) -> None:
+        """Removes what a trainer left half written that was killed; for the run's one trainer."""
+        for folder in (self.path, self.checkpoints):
+            remove_unfinished(folder)
+
     def next_attempt(self) -> int:
         """A number greater than all this gave before, from 0, also after a restart: on disk before it is returned."""
         file = self.path / 'attempts'
@@ -82,11 +87,7 @@ class RunFolder:
                 self._checkpoint(old).unlink(missing_ok=True)
 
     def newest_checkpoint(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
-        """Tensors and facts of the newest whole checkpoint; torn or corrupted ones are passed over.
-
-        For the run's one trainer: what an earlier one left half written is removed.
-        """
-        remove_unfinished(self.checkpoints)
+        """Tensors and facts of the newest whole checkpoint; torn or corrupted ones are passed over."""
         for update in reversed(self._updates()):
             try:
                 return decode_checkpoint(self._checkpoint(update).read_bytes())

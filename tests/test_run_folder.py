@@ -133,6 +133,7 @@ def test_what_a_killed_trainer_left_half_written_is_removed_by_the_next(tmp_path
     folder = folder_with(tmp_path, [1])
     (folder.checkpoints / '.checkpoint_00000002.safetensors.12.part').write_bytes(b'half')
     assert newest_update(folder) == 1
+    folder.remove_unfinished()
     assert len(list(folder.checkpoints.iterdir())) == 1
 
 
