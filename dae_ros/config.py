@@ -126,6 +126,8 @@ class RunSettings:
     evaluation_greedy: bool = setting(True, 'evaluate with each robot\'s most probable action instead of a drawn one')
     checkpoint_interval: int = setting(1, 'updates between checkpoints', unit='updates', minimum=1, maximum=1_000_000)
     keep_checkpoints: int = setting(3, 'newest checkpoints and policy versions kept on disk', minimum=1, maximum=1_000_000)
+    max_restarts: int = setting(5, 'times in a row, with nothing learnt in between, that a node which died is started again',
+                                minimum=0, maximum=1_000_000)
     keep_every: int = setting(1000, 'checkpoints of every so many updates are kept for good; 0 for none', unit='updates',
                               minimum=0, maximum=1_000_000)
 

@@ -53,7 +53,7 @@ class Training:
         self._training_rollouts = -(-settings.run.total_steps // self._steps_per_rollout)
         self._rollout = 0
         folder.remove_unfinished()
-        self._attempt = folder.next_attempt()
+        self.attempt = folder.next_attempt()  # 0 in a run that nothing has disturbed
         self._asked: int | None = None  # the rollout asked for last
         self._updates = 0
         self._seconds_before = 0.0
@@ -105,12 +105,12 @@ class Training:
     def request(self) -> RolloutRequest:
         """The rollout wanted now. Asking again without consuming begins it anew: the next attempt."""
         if self._asked == self._rollout:
-            self._attempt = self._folder.next_attempt()
+            self.attempt = self._folder.next_attempt()
         self._asked = self._rollout
         now = time.monotonic()
         self._began_at = self._began_at or now
         self._rollout_began_at = now
-        request = RolloutRequest(self.run, self._rollout, self._attempt, self.policy_version, self.settings.run.seed,
+        request = RolloutRequest(self.run, self._rollout, self.attempt, self.policy_version, self.settings.run.seed,
                                  self.settings.run.num_steps, self.evaluating and self.settings.run.evaluation_greedy)
         return request
 

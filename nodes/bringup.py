@@ -12,6 +12,7 @@ import queue
 import signal
 import sys
 import threading
+import time
 from datetime import datetime
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from dae_ros.config import SETTINGS, Settings
 from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.report.summary import Summary
+from dae_ros.restarts import Restarts, describe
 from dae_ros.ros.graph import find_task_file, node_environment, read_settings, training_graph
 from dae_ros.run_folder import RunFolder
 from dae_ros.worlds import world_spec
@@ -62,7 +64,7 @@ def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDis
 
 
 def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, display: ProgressDisplay) -> None:
-    """The run as separate processes. Raises DaeRosError when a node dies."""
+    """The run as separate processes; one that dies is started again. Raises DaeRosError when that does not help."""
     import rclpy
     from dae_ros_msgs.msg import TrainingStatus
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -90,30 +92,47 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
             pass
 
     spinning = threading.Thread(target=spin, daemon=True)
+    # The processes torchrun started learn with the trainer they found, and with no other.
+    restarts = Restarts(settings.run.max_restarts if torchrun.size() == 1 else 0)
+    graph = {process.name: process for process in training_graph(settings, folder)}
+    due = dict.fromkeys(graph, 0.0)  # when to start whom; s, monotonic
+    newest, detail = 0, ''
     try:
-        for process in training_graph(settings, folder):
-            command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
-                       *process.arguments(folder.settings_file, namespace)]
-            supervisor.start(process.name, command, os.environ)
-        spinning.start()
-        detail = ''
         while True:
-            name, event = events.get()
+            for name in [name for name, at in due.items() if at <= time.monotonic()]:
+                del due[name]
+                command = [sys.executable, '-m', f'dae_ros_nodes.{graph[name].executable}',
+                           *graph[name].arguments(folder.settings_file, namespace)]
+                supervisor.start(name, command, os.environ)
+            if spinning.ident is None:
+                spinning.start()
+            try:
+                name, event = events.get(timeout=max(0.0, min(due.values()) - time.monotonic()) if due else None)
+            except queue.Empty:
+                continue
             if name == 'status':
-                if event.run == folder.run:
-                    display.update(states.get(event.state, '?'), event.environment_steps, event.total_steps,
-                                   event.mean_return, event.steps_per_second, event.policy_version)
-                    if event.detail not in ('', detail):
-                        display.note(event.detail)
-                    detail = event.detail
+                if event.run != folder.run:
+                    continue
+                if event.policy_version > newest:
+                    newest = event.policy_version
+                    restarts.got_on()
+                display.update(states.get(event.state, '?'), event.environment_steps, event.total_steps,
+                               event.mean_return, event.steps_per_second, event.policy_version)
+                if event.detail not in ('', detail):
+                    display.note(event.detail)
+                detail = event.detail
             elif name == 'trainer' and event == 0:
                 if not folder.summary_file.exists():
                     raise DaeRosError(f'the trainer was stopped before its end; --run-folder {folder.path} goes on from there')
                 return
             else:
-                tail = supervisor.log_file(name).read_text(errors='replace').splitlines()[-LOG_TAIL:]
-                raise DaeRosError('\n'.join([f'{name} ended with exit code {event}; the end of '
-                                             f'{supervisor.log_file(name)}:', *tail]))
+                delay = restarts.delay(name, event)
+                if delay is None:
+                    log = supervisor.log_file(name)
+                    tail = log.read_text(errors='replace').splitlines()[-LOG_TAIL:]
+                    raise DaeRosError('\n'.join([f'{name} {describe(event)}; the end of {log}:', *tail]))
+                display.note(f'{name} {describe(event)} and is started again')
+                due[name] = time.monotonic() + delay
     finally:
         supervisor.stop()
         rclpy.try_shutdown()

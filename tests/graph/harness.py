@@ -107,6 +107,18 @@ def processes_naming(text: str) -> list[str]:
     return lines
 
 
+def pid_of(node: str, folder: Path) -> int | None:
+    """The process of a node of the run that lies below `folder`; None where it is not running."""
+    for entry in Path('/proc').iterdir():
+        try:
+            arguments = (entry / 'cmdline').read_bytes().decode(errors='replace').split('\0')
+        except (OSError, NotADirectoryError):
+            continue
+        if f'__node:={node}' in arguments and any(str(folder) in argument for argument in arguments):
+            return int(entry.name)
+    return None
+
+
 class Listener:
     """A node in the test process that hears what a team publishes."""
 
