@@ -37,3 +37,35 @@ def describe(code: int) -> str:
         return f'was killed by {signal.Signals(-code).name}'
     except ValueError:
         return f'was killed by signal {-code}'
+
+
+class SignsOfLife:
+    """Who is silent: has been started, has not ended, and has said nothing for `limit` seconds."""
+
+    def __init__(self, limit: float):
+        self.limit = limit
+        self._heard: dict[str, float] = {}
+
+    def started(self, name: str, now: float) -> None:
+        """From here on the node is expected to speak."""
+        self._heard[name] = now
+
+    def heard(self, name: str, now: float) -> None:
+        """The node spoke; of one that has ended this is an echo."""
+        if name in self._heard:
+            self._heard[name] = now
+
+    def ended(self, name: str) -> None:
+        """From here on nothing is expected of the node."""
+        self._heard.pop(name, None)
+
+    def deadlines(self) -> list[float]:
+        """When each node will be silent unless it is heard before."""
+        return [heard + self.limit for heard in self._heard.values()]
+
+    def silent(self, now: float) -> list[str]:
+        """Who is silent now; named once."""
+        silent = [name for name, heard in self._heard.items() if now - heard >= self.limit]
+        for name in silent:
+            self.ended(name)
+        return silent

@@ -17,7 +17,6 @@ from dae_ros.ros.graph import find_task_file, node_environment, read_settings, t
 from dae_ros.run_folder import RunFolder
 from launch import LaunchDescription
 
-
 RESPAWN_DELAY = 2.0  # s
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dae_ros.restarts import EXIT_REFUSED, LONGEST_DELAY, Restarts, describe
+from dae_ros.restarts import EXIT_REFUSED, LONGEST_DELAY, Restarts, SignsOfLife, describe
 
 
 def test_a_node_that_keeps_dying_is_started_again_ever_later_and_in_the_end_no_more():
@@ -29,3 +29,17 @@ def test_a_node_that_refuses_its_settings_is_not_started_again():
                                          (-77, 'was killed by signal 77')])
 def test_an_exit_code_is_told_in_words(code, words):
     assert describe(code) == words
+
+
+def test_a_node_is_silent_that_was_started_and_not_heard_for_long():
+    signs = SignsOfLife(10)
+    signs.heard('world', 0)
+    assert signs.silent(100) == signs.deadlines() == []
+    signs.started('world', 100)
+    signs.started('trainer', 103)
+    signs.heard('world', 105)
+    assert signs.deadlines() == [115, 113] and signs.silent(112) == []
+    assert signs.silent(113) == ['trainer'] and signs.silent(114) == []
+    signs.ended('world')
+    signs.heard('world', 114)
+    assert signs.silent(200) == signs.deadlines() == []

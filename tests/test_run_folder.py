@@ -1,6 +1,8 @@
 """The folder of a run: it belongs to one set of settings and gives the newest whole checkpoint back."""
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -174,6 +176,36 @@ def test_a_write_that_is_cut_short_leaves_the_checkpoints_there_were(tmp_path, m
                     folder.save_checkpoint(update, tensors(9), {'updates': 9})
         assert len(list(folder.checkpoints.iterdir())) == 2
         assert newest_update(RunFolder(tmp_path, SETTINGS)) == 2
+
+
+WRITER = '''
+import os, sys, time
+from pathlib import Path
+import numpy as np
+from dae_ros import config
+from dae_ros.run_folder import RunFolder
+
+def stop_here(*arguments):
+    print(flush=True)
+    time.sleep(600)
+
+folder = RunFolder(Path(sys.argv[1]), config.from_flat({'keep_checkpoints': 3, 'beta': 0.5}))
+setattr(os, sys.argv[2], stop_here)
+folder.save_checkpoint(2, {'weights': np.full((2, 3), 2, np.float32)}, {'updates': 2})
+'''
+
+
+@pytest.mark.parametrize('moment', ['fsync', 'replace'])
+def test_a_writer_killed_in_the_middle_of_a_checkpoint_leaves_the_one_before(tmp_path, moment):
+    folder = folder_with(tmp_path, [1])
+    with subprocess.Popen([sys.executable, '-c', WRITER, str(tmp_path), moment], stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b'\n'
+        writer.kill()
+    assert len(list(folder.checkpoints.iterdir())) == 2
+    again = RunFolder(tmp_path, SETTINGS)
+    again.remove_unfinished()
+    assert newest_update(again) == 1
+    assert len(list(folder.checkpoints.iterdir())) == 1
 
 
 def test_files_of_other_names_are_not_checkpoints(tmp_path):
