@@ -27,6 +27,10 @@ class RunFolderError(DaeRosError):
     """A run's folder cannot be used: it holds another run, or cannot be written."""
 
 
+class StalledError(DaeRosError):
+    """A run cannot go on: nobody answers, however often they are asked."""
+
+
 class Refused(DaeRosError):
     """A message from outside that is not acted on.
 

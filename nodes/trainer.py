@@ -26,7 +26,7 @@ from dae_ros.config import (
     declarations,
     from_flat,
 )
-from dae_ros.errors import DaeRosError
+from dae_ros.errors import DaeRosError, StalledError
 from dae_ros.final_report import write_report
 from dae_ros.learning.distributed import help_to_learn
 from dae_ros.restarts import EXIT_REFUSED
@@ -78,6 +78,7 @@ class TrainerNode(TeamNode):
         self.create_service(Trigger, names.SAVE, self._on_save)
         self._heard = False  # whether anything of the rollout under way has arrived, and when the last of it; s, monotonic
         self._heard_at = 0.0
+        self._silent_attempts = 0  # in a row
         # Seconds without a message after which a rollout is begun anew.
         self._patience = SHORT_PATIENCE if self._training.attempt else settings.run.rollout_timeout
         self.every(min(SHORT_PATIENCE, settings.run.rollout_timeout) / 4, self._begin_anew_if_silent)
@@ -156,7 +157,7 @@ class TrainerNode(TeamNode):
         self._heard, self._heard_at = True, time.monotonic()
         if not self._assembler.complete:
             return
-        self._patience = self._training.settings.run.rollout_timeout
+        self._patience, self._silent_attempts = self._training.settings.run.rollout_timeout, 0
         trajectory = self._assembler.trajectory()
         if not self._training.evaluating:
             self._announce(Status.LEARNING, '')
@@ -168,13 +169,19 @@ class TrainerNode(TeamNode):
 
     def _begin_anew_if_silent(self) -> None:
         """Begins a rollout anew when nothing of it has come for too long. A timer set anew by each message would cost more."""
-        timeout = self._training.settings.run.rollout_timeout
-        patience = min(self._patience, timeout)
-        if self._collecting and time.monotonic() - self._heard_at >= patience:
-            self.get_logger().warning(f'nothing heard for {patience} s; missing: {self._assembler.missing()}; the rollout is '
-                                      'begun anew')
-            self._patience = min(2 * patience, timeout)  # worlds may be slow
-            self._advance()
+        settings = self._training.settings.run
+        patience = min(self._patience, settings.rollout_timeout)
+        if not self._collecting or time.monotonic() - self._heard_at < patience:
+            return
+        sentence = f'nothing heard for {patience:g} s; missing: {self._assembler.missing()}'
+        self._silent_attempts += 1
+        if self._silent_attempts >= settings.max_silent_attempts:
+            raise StalledError(f'given up after {self._silent_attempts} attempts at a rollout: {sentence}')
+        self.get_logger().warning(f'{sentence}; the rollout is begun anew')
+        if patience == settings.rollout_timeout:
+            self._announce(self._state, sentence)
+        self._patience = 2 * patience  # worlds may be slow
+        self._advance()
 
     def _finish(self) -> None:
         self._announce(Status.EVALUATING, 'drawing the report')
@@ -220,7 +227,13 @@ class TrainerNode(TeamNode):
     def diagnose(self):
         training = self._training
         missing = self._missing()
-        sentence = f'waiting for {", ".join(missing)}' if missing else f'policy version {training.policy_version}'
+        silent = time.monotonic() - self._heard_at
+        if missing:
+            sentence = f'waiting for {", ".join(missing)}'
+        elif self._collecting and silent >= SHORT_PATIENCE:
+            sentence = f'nothing heard for {silent:.0f} s; missing: {self._assembler.missing()}'
+        else:
+            sentence = f'policy version {training.policy_version}'
         return sentence, {'run': f'{training.run:x}', 'environment steps': training.environment_steps,
                           'mean return': training.mean_return}
 

@@ -43,7 +43,7 @@ class Graph:
         self._namespace = namespace
         self.processes = {process.name: process for process in training_graph(settings, self.folder)}
         self._codes: dict[str, int] = {}
-        self._pids: dict[str, int] = {}
+        self.pids: dict[str, int] = {}
         self._supervisor = Supervisor(path / 'logs', self._codes.__setitem__)
 
     @property
@@ -55,12 +55,12 @@ class Graph:
             process = self.processes[name]
             command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
                        *process.arguments(self.folder.settings_file, self._namespace)]
-            self._pids[name] = self._supervisor.start(name, command, os.environ)
+            self.pids[name] = self._supervisor.start(name, command, os.environ)
 
     def kill(self, *names: str) -> None:
         """Kills nodes that were started; they are gone when this returns."""
         for name in names:
-            os.kill(self._pids[name], signal.SIGKILL)
+            os.kill(self.pids[name], signal.SIGKILL)
         for name in names:
             self.wait(name)
 

@@ -139,3 +139,20 @@ def test_a_node_that_is_alive_but_silent_is_replaced_and_named(disturb, undistur
         sentence = 'agent_1 has said nothing for 15 s and is killed'
         listener.spin_until(lambda: any((status.name, status.message) == ('/agent_1', sentence) for status in told))
     assert sentence in run.assert_ends_with(undisturbed(UPDATES))
+
+
+def test_a_trainer_whom_nobody_answers_says_so_and_gives_up_with_everything_saved(make_graph, undisturbed, tmp_path):
+    values = {**VALUES, 'rollout_timeout': 1.0, 'max_silent_attempts': 4}
+    graph = make_graph(tmp_path / 'run', values)
+    graph.start(*graph.names)
+    with Listener() as listener:
+        listener.wait_for_status(lambda status: status.policy_version >= 3)
+        os.kill(graph.pids['world'], signal.SIGSTOP)
+        listener.wait_for_status(lambda status: status.detail.startswith('nothing heard for 1 s; missing: '))
+    assert graph.wait('trainer') == 2
+    assert 'error: given up after 4 attempts at a rollout: nothing heard for 1 s' in graph.log('trainer')
+    assert 'Traceback' not in graph.log('trainer')
+    os.kill(graph.pids['world'], signal.SIGCONT)
+    graph.start('trainer')
+    assert graph.wait('trainer') == 0, graph.log('trainer')
+    assert graph.result() == undisturbed(UPDATES)
