@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 from pathlib import Path
-from typing import Any, Mapping
+from typing import Any, BinaryIO, Mapping
 
 import numpy as np
 
@@ -64,10 +65,21 @@ class RunFolder:
     def summary_file(self) -> Path:
         return self.path / 'summary.json'
 
-    def remove_unfinished(self) -> None:
-        """Removes what a trainer left half written that was killed; for the run's one trainer."""
+    def claim(self) -> BinaryIO:
+        """Keeps other trainings out of this folder until what this returns is closed, by the end of the process at the latest.
+
+        Raises RunFolderError if there is one. Removes what one that was killed left half written.
+        """
+        try:
+            lock = open(self.path / 'lock', 'wb')
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunFolderError(f'another trainer is at work in {self.path}; stop it or choose another folder') from error
+        except OSError as error:
+            raise RunFolderError(f'cannot write the run folder {self.path}: {error.strerror}') from error
         for folder in (self.path, self.checkpoints):
             remove_unfinished(folder)
+        return lock
 
     def next_attempt(self) -> int:
         """A number greater than all this gave before, from 0, also after a restart: on disk before it is returned."""

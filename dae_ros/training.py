@@ -46,13 +46,13 @@ class Training:
         self.mean_return = math.nan
         self.evaluation: np.ndarray = np.empty(0)
         self._folder = folder
+        self._claim = folder.claim()
         self._writer = ThreadPoolExecutor(1, 'checkpoints')
         self._writing: Future | None = None
         self._learner = make_learner(spec, settings)
         self._steps_per_rollout = settings.task.num_worlds * settings.run.num_steps
         self._training_rollouts = -(-settings.run.total_steps // self._steps_per_rollout)
         self._rollout = 0
-        folder.remove_unfinished()
         self.attempt = folder.next_attempt()  # 0 in a run that nothing has disturbed
         self._asked: int | None = None  # the rollout asked for last
         self._updates = 0
@@ -145,6 +145,7 @@ class Training:
             self._writer.shutdown()
             self._learner.close()
             self._log.close()
+            self._claim.close()
 
     def _learn(self, trajectory: Trajectory) -> None:
         began = time.monotonic()

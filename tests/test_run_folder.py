@@ -135,7 +135,7 @@ def test_what_a_killed_trainer_left_half_written_is_removed_by_the_next(tmp_path
     folder = folder_with(tmp_path, [1])
     (folder.checkpoints / '.checkpoint_00000002.safetensors.12.part').write_bytes(b'half')
     assert newest_update(folder) == 1
-    folder.remove_unfinished()
+    folder.claim().close()
     assert len(list(folder.checkpoints.iterdir())) == 1
 
 
@@ -203,7 +203,7 @@ def test_a_writer_killed_in_the_middle_of_a_checkpoint_leaves_the_one_before(tmp
         writer.kill()
     assert len(list(folder.checkpoints.iterdir())) == 2
     again = RunFolder(tmp_path, SETTINGS)
-    again.remove_unfinished()
+    again.claim().close()
     assert newest_update(again) == 1
     assert len(list(folder.checkpoints.iterdir())) == 1
 
@@ -216,6 +216,22 @@ def test_files_of_other_names_are_not_checkpoints(tmp_path):
     assert newest_update(folder) == 1
     folder_with(tmp_path, range(2, 6))
     assert (folder.checkpoints / 'checkpoint_best.safetensors').exists()
+
+
+def test_a_folder_belongs_to_one_trainer_at_a_time(tmp_path):
+    folder, again = (RunFolder(tmp_path, SETTINGS) for _ in range(2))
+    claim = folder.claim()
+    with pytest.raises(RunFolderError, match=f'^another trainer is at work in {tmp_path}; '):
+        again.claim()
+    claim.close()
+    again.claim().close()
+
+
+def test_a_folder_that_can_only_be_read_is_an_error_that_names_it(tmp_path):
+    folder = RunFolder(tmp_path, SETTINGS)
+    (tmp_path / 'lock').mkdir()  # nobody may write here, root included
+    with pytest.raises(RunFolderError, match=f'^cannot write the run folder {tmp_path}: '):
+        folder.claim()
 
 
 def test_the_same_folder_by_another_path_is_the_same_run(tmp_path, monkeypatch):

@@ -353,7 +353,7 @@ def test_the_trained_policy_is_left_as_a_file(undisturbed):
 
 
 def test_a_finished_training_opened_again_learns_nothing_more_and_is_evaluated_anew(begin, undisturbed):
-    begin(NAVIGATION, 'finished').train()
+    begin(NAVIGATION, 'finished').train().training.close()
     again = begin(NAVIGATION, 'finished')
     assert again.training.evaluating and not again.training.finished
     assert_same_end(again.train(), undisturbed(NAVIGATION))
