@@ -72,9 +72,11 @@ class RunFolder:
         """
         try:
             lock = open(self.path / 'lock', 'wb')
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunFolderError(f'another trainer is at work in {self.path}; stop it or choose another folder') from error
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                lock.close()
+                raise RunFolderError(f'another trainer is at work in {self.path}; stop it or choose another folder') from error
         except OSError as error:
             raise RunFolderError(f'cannot write the run folder {self.path}: {error.strerror}') from error
         for folder in (self.path, self.checkpoints):
