@@ -2,7 +2,7 @@
 # PYTHON names the interpreter for .venv; without it, set-up takes the first suitable one it finds.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help build demo test bench bench-peers reproduce lint lock clean
+.PHONY: help build demo test chaos bench bench-peers reproduce lint lock clean
 export PYTHON
 # Those of the named options that have a value, as the program takes them.
 given = $(foreach option,$(1),$(if $($(option)),--$(option) $($(option))))
@@ -18,6 +18,9 @@ demo: build  ## train cooperative navigation over a ROS graph on this machine; A
 
 test: build  ## run every test; ARGS goes to pytest
 	@. scripts/env.sh && exec python -m pytest $(ARGS)
+
+chaos: build  ## kill nodes at random during a training, 40 times, and compare the weights; kills=100 seed=2
+	@. scripts/env.sh && CHAOS_KILLS=$(or $(kills),40) CHAOS_SEED=$(or $(seed),1) exec python -m pytest -s tests/graph/test_chaos.py $(ARGS)
 
 bench: build  ## measure speeds and phases on this machine; ARGS names parts, such as scale
 	@. scripts/env.sh && exec python -m benchmarks $(ARGS)

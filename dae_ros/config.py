@@ -123,8 +123,16 @@ class RunSettings:
     evaluation_episodes: int = setting(512, 'fresh episodes played with the trained team at the end; 0 for none',
                                        unit='episodes', minimum=0, maximum=1_000_000)
     evaluation_greedy: bool = setting(True, 'evaluate with each robot\'s most probable action instead of a drawn one')
-    checkpoint_interval: int = setting(10, 'updates between checkpoints', unit='updates', minimum=1, maximum=1_000_000)
+    checkpoint_interval: int = setting(1, 'updates between checkpoints', unit='updates', minimum=1, maximum=1_000_000)
     keep_checkpoints: int = setting(3, 'newest checkpoints and policy versions kept on disk', minimum=1, maximum=1_000_000)
+    max_restarts: int = setting(5, 'times in a row, with nothing learnt in between, that a node which died is started again',
+                                minimum=0, maximum=1_000_000)
+    max_silent_attempts: int = setting(20, 'attempts in a row at a rollout that fell silent before its end, after which the '
+                                           'trainer gives up', minimum=1, maximum=1_000_000)
+    silence_timeout: float = setting(300.0, 'a node that has given no sign of life for this long, longer than any update takes, '
+                                            'is replaced by bringup', unit='s', minimum=1.0, maximum=86_400.0)
+    keep_every: int = setting(1000, 'checkpoints of every so many updates are kept for good; 0 for none', unit='updates',
+                              minimum=0, maximum=1_000_000)
 
 
 @dataclass(frozen=True)

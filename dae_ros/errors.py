@@ -19,8 +19,16 @@ class WorldError(DaeRosError):
     """A task cannot be simulated as asked."""
 
 
+class FileError(DaeRosError):
+    """A file cannot be written: the disk is full, or it may not be."""
+
+
 class RunFolderError(DaeRosError):
     """A run's folder cannot be used: it holds another run, or cannot be written."""
+
+
+class StalledError(DaeRosError):
+    """A run cannot go on: nobody answers, however often they are asked."""
 
 
 class Refused(DaeRosError):

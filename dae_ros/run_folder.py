@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 from pathlib import Path
-from typing import Any, Mapping
+from typing import Any, BinaryIO, Mapping
 
 import numpy as np
 
 from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.errors import Refused, RunFolderError
-from dae_ros.files import write_atomically
+from dae_ros.files import remove_unfinished, write_atomically
 from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint
 
 
@@ -26,6 +27,7 @@ class RunFolder:
         self.path = path
         self.run = _identity(settings, path)
         self._keep = settings.run.keep_checkpoints
+        self._keep_every = settings.run.keep_every
         text = config.to_yaml(settings)
         try:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
@@ -63,11 +65,40 @@ class RunFolder:
     def summary_file(self) -> Path:
         return self.path / 'summary.json'
 
+    def claim(self) -> BinaryIO:
+        """Keeps other trainings out of this folder until what this returns is closed, by the end of the process at the latest.
+
+        Raises RunFolderError if there is one. Removes what one that was killed left half written.
+        """
+        try:
+            lock = open(self.path / 'lock', 'wb')
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                lock.close()
+                raise RunFolderError(f'another trainer is at work in {self.path}; stop it or choose another folder') from error
+        except OSError as error:
+            raise RunFolderError(f'cannot write the run folder {self.path}: {error.strerror}') from error
+        for folder in (self.path, self.checkpoints):
+            remove_unfinished(folder)
+        return lock
+
+    def next_attempt(self) -> int:
+        """A number greater than all this gave before, from 0, also after a restart: on disk before it is returned."""
+        file = self.path / 'attempts'
+        try:
+            attempt = int(file.read_text(encoding='ascii')) if file.exists() else 0
+        except ValueError as error:
+            raise RunFolderError(f'{file} should hold the number of attempts; stop all nodes of the run and delete it') from error
+        write_atomically(file, f'{attempt + 1}\n'.encode())
+        return attempt
+
     def save_checkpoint(self, update: int, tensors: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
         """Writes the checkpoint after `update` updates and deletes the oldest beyond those kept."""
         write_atomically(self._checkpoint(update), encode_checkpoint(tensors, facts))
         for old in self._updates()[:-self._keep]:
-            self._checkpoint(old).unlink(missing_ok=True)
+            if not self._keep_every or old % self._keep_every:
+                self._checkpoint(old).unlink(missing_ok=True)
 
     def newest_checkpoint(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
         """Tensors and facts of the newest whole checkpoint; torn or corrupted ones are passed over."""

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
@@ -46,11 +48,15 @@ class Training:
         self.mean_return = math.nan
         self.evaluation: np.ndarray = np.empty(0)
         self._folder = folder
+        self._claim = folder.claim()
+        self._writer = ThreadPoolExecutor(1, 'checkpoints')
+        self._writing: Future | None = None
         self._learner = make_learner(spec, settings, exact_rewards)
         self._steps_per_rollout = settings.task.num_worlds * settings.run.num_steps
         self._training_rollouts = -(-settings.run.total_steps // self._steps_per_rollout)
         self._rollout = 0
-        self._attempt = 0
+        self.attempt = folder.next_attempt()  # 0 in a run that nothing has disturbed
+        self._asked: int | None = None  # the rollout asked for last
         self._updates = 0
         self._seconds_before = 0.0
         resumed = folder.newest_checkpoint()
@@ -100,12 +106,14 @@ class Training:
 
     def request(self) -> RolloutRequest:
         """The rollout wanted now. Asking again without consuming begins it anew: the next attempt."""
+        if self._asked == self._rollout:
+            self.attempt = self._folder.next_attempt()
+        self._asked = self._rollout
         now = time.monotonic()
         self._began_at = self._began_at or now
         self._rollout_began_at = now
-        request = RolloutRequest(self.run, self._rollout, self._attempt, self.policy_version, self.settings.run.seed,
+        request = RolloutRequest(self.run, self._rollout, self.attempt, self.policy_version, self.settings.run.seed,
                                  self.settings.run.num_steps, self.evaluating and self.settings.run.evaluation_greedy)
-        self._attempt += 1
         return request
 
     def consume(self, trajectory: Trajectory) -> None:
@@ -117,14 +125,11 @@ class Training:
             self.mean_return = float(returns.mean()) if len(returns) else math.nan
             self._learn(trajectory)
         self._rollout += 1
-        self._attempt = 0
 
     def save(self) -> None:
-        """Writes a checkpoint of the training as it stands."""
-        facts = {'settings': config.digest(self.settings), 'updates': self._updates, 'rollout': self._rollout,
-                 'seconds': self.seconds, 'mean_return': self.mean_return}
-        self._folder.save_checkpoint(self._updates, self._learner.state(), facts)
-        write_atomically(self._folder.policy_file, encode_policy(self.policy))
+        """Writes a checkpoint of the training as it stands; FileError if one could not be written."""
+        self._begin_to_save()
+        self._wait_until_saved()
 
     def expected_rewards(self, trajectory: Trajectory) -> np.ndarray:
         """As `Learner.expected_rewards`."""
@@ -135,9 +140,14 @@ class Training:
         return tensors_sha256(self._learner.state())
 
     def close(self) -> None:
-        """Ends the learner's threads and closes the metrics."""
-        self._learner.close()
-        self._log.close()
+        """Ends the threads and closes the metrics; FileError if the last checkpoint could not be written."""
+        try:
+            self._wait_until_saved()
+        finally:
+            self._writer.shutdown()
+            self._learner.close()
+            self._log.close()
+            self._claim.close()
 
     def _learn(self, trajectory: Trajectory) -> None:
         began = time.monotonic()
@@ -148,8 +158,28 @@ class Training:
         self._log.write(self.environment_steps, {
             'mean_return': self.mean_return, **metrics, 'seconds/collecting': began - self._rollout_began_at,
             'seconds/learning': ended - began, 'steps_per_second': self.steps_per_second})
-        if self._updates % self.settings.run.checkpoint_interval == 0 or self.evaluating:
+        if self.evaluating:
             self.save()
+        elif self._updates % self.settings.run.checkpoint_interval == 0:
+            self._begin_to_save()
+
+    def _begin_to_save(self) -> None:
+        """Has a checkpoint written while the next rollout is collected, which does not need it: a trainer killed before the
+        file is whole goes on from the one before, to the same weights."""
+        self._wait_until_saved()
+        tensors = {name: tensor.copy() for name, tensor in self._learner.state().items()}
+        facts = {'settings': config.digest(self.settings), 'updates': self._updates, 'rollout': self._rollout,
+                 'seconds': self.seconds, 'mean_return': self.mean_return}
+        self._writing = self._writer.submit(self._write, self._updates, tensors, facts, encode_policy(self.policy))
+
+    def _write(self, update: int, tensors: dict[str, np.ndarray], facts: dict[str, Any], policy: bytes) -> None:
+        self._folder.save_checkpoint(update, tensors, facts)
+        write_atomically(self._folder.policy_file, policy)
+
+    def _wait_until_saved(self) -> None:
+        writing, self._writing = self._writing, None
+        if writing is not None:
+            writing.result()
 
     def _resume(self, tensors, facts) -> None:
         self._learner.load_state(tensors)

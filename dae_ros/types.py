@@ -22,6 +22,20 @@ class WorldSpec(NamedTuple):
     state_is_observations: bool  # the state is the N observations one after another (S = N * O)
 
 
+class Order(NamedTuple):
+    """What supersedes what within a run: of two rollouts asked for, the greater one was asked for later.
+
+    Attempts come first. They count what was begun anew, over the whole run and across the trainer's restarts, and never go
+    down; so a trainer that comes back at an earlier rollout supersedes what is under way, and nothing from before does.
+    """
+
+    attempt: int
+    rollout: int
+
+    def __str__(self) -> str:
+        return f'rollout {self.rollout} attempt {self.attempt}'
+
+
 class Stamp(NamedTuple):
     """Where in a run a datum belongs."""
 
@@ -29,6 +43,10 @@ class Stamp(NamedTuple):
     rollout: int
     attempt: int
     step: int
+
+    @property
+    def order(self) -> Order:
+        return Order(self.attempt, self.rollout)
 
 
 class Observation(NamedTuple):
@@ -80,6 +98,10 @@ class RolloutRequest(NamedTuple):
     seed: int
     num_steps: int             # T
     greedy: bool
+
+    @property
+    def order(self) -> Order:
+        return Order(self.attempt, self.rollout)
 
 
 class PolicyWeights(NamedTuple):

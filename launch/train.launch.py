@@ -12,24 +12,36 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironment
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from dae_ros.restarts import Restarts, describe
 from dae_ros.ros.graph import find_task_file, node_environment, read_settings, training_graph
 from dae_ros.run_folder import RunFolder
 from launch import LaunchDescription
 
+RESPAWN_DELAY = 2.0  # s
+
 
 def start(context) -> list:
-    """The nodes of the run that the launch arguments describe; when one ends, all do."""
+    """The nodes of the run that the launch arguments describe; when the trainer is done, or one keeps dying, all end."""
     names = ('task_file', 'namespace', 'run_folder', 'parameters')
     argument = {name: LaunchConfiguration(name).perform(context) for name in names}
     task_file = find_task_file(argument['task_file'])
     settings = read_settings(task_file, argument['parameters'].split())
     path = argument['run_folder'] or f'runs/{task_file.stem}-{datetime.now():%Y%m%d-%H%M%S}'
     folder = RunFolder(Path(path).absolute(), settings)
+    restarts = Restarts(settings.run.max_restarts)
+
+    def end_all(name: str):
+        def on_exit(event, _) -> Shutdown | None:
+            if (name, event.returncode) == ('trainer', 0) or restarts.delay(name, event.returncode) is None:
+                return Shutdown(reason=f'{name} {describe(event.returncode)}')
+
+        return on_exit
+
     environment = [SetEnvironmentVariable(name, value) for name, value in node_environment().items()]
     return environment + [
         Node(package='dae_ros', executable=process.executable, name=process.name, namespace=argument['namespace'],
              parameters=[str(folder.settings_file), {name: value for name, value in process.parameters.items()}],
-             output='screen', on_exit=Shutdown(reason=f'{process.name} has ended'))
+             output='screen', respawn=True, respawn_delay=RESPAWN_DELAY, on_exit=end_all(process.name))
         for process in training_graph(settings, folder)]
 
 

@@ -49,6 +49,7 @@ class AgentNode(TeamNode):
     def _on_request(self, message: msg.RolloutRequest) -> None:
         try:
             self._act(self._end.on_request(convert.rollout_request(message)))
+            self._fetching = None  # the server asked for an earlier attempt may have died
         finally:
             self._fetch_if_passed()
 

@@ -7,11 +7,8 @@
 from __future__ import annotations
 
 import argparse
-import os
-import queue
 import signal
 import sys
-import threading
 from datetime import datetime
 from pathlib import Path
 
@@ -20,11 +17,9 @@ from dae_ros.config import SETTINGS, Settings
 from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.report.summary import Summary
-from dae_ros.ros.graph import find_task_file, node_environment, read_settings, training_graph
+from dae_ros.ros.graph import find_task_file, read_settings
 from dae_ros.run_folder import RunFolder
 from dae_ros.worlds import world_spec
-
-LOG_TAIL = 15  # lines of a dead node's log that are shown
 
 
 def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
@@ -62,63 +57,10 @@ def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDis
 
 
 def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, display: ProgressDisplay) -> None:
-    """The run as separate processes. Raises DaeRosError when a node dies."""
-    import rclpy
-    from dae_ros_msgs.msg import TrainingStatus
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-    from rclpy.signals import SignalHandlerOptions
+    """The run as separate processes. Raises DaeRosError when it cannot go on."""
+    from dae_ros.ros.graph_run import GraphRun
 
-    from dae_ros.ros import names, qos
-    from dae_ros.ros.supervisor import Supervisor
-
-    states = {getattr(TrainingStatus, name): name.lower() for name in
-              ('WAITING', 'COLLECTING', 'LEARNING', 'PAUSED', 'EVALUATING', 'FINISHED', 'FAILED')}
-    events: queue.SimpleQueue = queue.SimpleQueue()
-    supervisor = Supervisor(folder.path / 'logs', lambda name, code: events.put((name, code)))
-    os.environ.update(node_environment())  # for this process too: it must hear the status
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node('bringup', namespace=namespace, start_parameter_services=False)
-    node.create_subscription(TrainingStatus, names.TRAINING_STATUS, lambda status: events.put(('status', status)),
-                             qos.LATCHED_INPUT)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-
-    def spin() -> None:
-        try:
-            executor.spin()
-        except ExternalShutdownException:
-            pass
-
-    spinning = threading.Thread(target=spin, daemon=True)
-    try:
-        for process in training_graph(settings, folder):
-            command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
-                       *process.arguments(folder.settings_file, namespace)]
-            supervisor.start(process.name, command, os.environ)
-        spinning.start()
-        detail = ''
-        while True:
-            name, event = events.get()
-            if name == 'status':
-                if event.run == folder.run:
-                    display.update(states.get(event.state, '?'), event.environment_steps, event.total_steps,
-                                   event.mean_return, event.steps_per_second, event.policy_version)
-                    if event.detail not in ('', detail):
-                        display.note(event.detail)
-                    detail = event.detail
-            elif name == 'trainer' and event == 0:
-                if not folder.summary_file.exists():
-                    raise DaeRosError(f'the trainer was stopped before its end; --run-folder {folder.path} goes on from there')
-                return
-            else:
-                tail = supervisor.log_file(name).read_text(errors='replace').splitlines()[-LOG_TAIL:]
-                raise DaeRosError('\n'.join([f'{name} ended with exit code {event}; the end of '
-                                             f'{supervisor.log_file(name)}:', *tail]))
-    finally:
-        supervisor.stop()
-        rclpy.try_shutdown()
-        if spinning.ident is not None:
-            spinning.join()
+    GraphRun(settings, folder, namespace, display).run()
 
 
 def interrupt(number: int, frame) -> None:

@@ -26,9 +26,10 @@ from dae_ros.config import (
     declarations,
     from_flat,
 )
-from dae_ros.errors import DaeRosError
+from dae_ros.errors import DaeRosError, StalledError
 from dae_ros.final_report import write_report
 from dae_ros.learning.distributed import help_to_learn
+from dae_ros.restarts import EXIT_REFUSED
 from dae_ros.rollout.groups import GroupedAssembler
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
@@ -40,6 +41,7 @@ from dae_ros.worlds import world_spec
 
 Status = msg.TrainingStatus
 FAREWELL = Duration(seconds=2)  # to let the last status reach who listens
+SHORT_PATIENCE = 1.0  # s; with nodes that have just started: what is sent before they have found each other may be lost
 
 
 class GroupInputs(NamedTuple):
@@ -74,8 +76,12 @@ class TrainerNode(TeamNode):
         self.create_service(Trigger, names.PAUSE, self._on_pause)
         self.create_service(Trigger, names.RESUME, self._on_resume)
         self.create_service(Trigger, names.SAVE, self._on_save)
-        self._heard_at = 0.0  # of the rollout under way; s, monotonic
-        self.every(settings.run.rollout_timeout / 4, self._begin_anew_if_silent)
+        self._heard = False  # whether anything of the rollout under way has arrived, and when the last of it; s, monotonic
+        self._heard_at = 0.0
+        self._silent_attempts = 0  # in a row
+        # Seconds without a message after which a rollout is begun anew.
+        self._patience = SHORT_PATIENCE if self._training.attempt else settings.run.rollout_timeout
+        self.every(min(SHORT_PATIENCE, settings.run.rollout_timeout) / 4, self._begin_anew_if_silent)
         self._publish_policy()
         self._advance()
 
@@ -99,8 +105,19 @@ class TrainerNode(TeamNode):
     # The run, from rollout to rollout.
 
     def on_matched(self) -> None:
-        if self._state == Status.WAITING:
+        if self._state == Status.WAITING or self._collecting and self._missing():
             self._advance()
+
+    def on_new_source(self) -> None:
+        """Begins the rollout anew that a world or an agent cannot join in its middle; one still to begin it hears of itself."""
+        if self._collecting:
+            self._patience = SHORT_PATIENCE
+            if self._heard:
+                self._advance()
+
+    @property
+    def _collecting(self) -> bool:
+        return self._state in (Status.COLLECTING, Status.EVALUATING)
 
     def _advance(self) -> None:
         """Does what comes next: wait, pause, ask for a rollout, or report and end."""
@@ -118,7 +135,7 @@ class TrainerNode(TeamNode):
     def _ask(self) -> None:
         request = self._training.request()
         self._assembler.begin(request)
-        self._heard_at = time.monotonic()
+        self._heard, self._heard_at = False, time.monotonic()
         self._announce(Status.EVALUATING if self._training.evaluating else Status.COLLECTING, '')
         self._request.publish(convert.rollout_request_message(request))
 
@@ -137,9 +154,10 @@ class TrainerNode(TeamNode):
 
     def _collected(self) -> None:
         """Learns once the rollout is complete."""
-        self._heard_at = time.monotonic()
+        self._heard, self._heard_at = True, time.monotonic()
         if not self._assembler.complete:
             return
+        self._patience, self._silent_attempts = self._training.settings.run.rollout_timeout, 0
         trajectory = self._assembler.trajectory()
         if not self._training.evaluating:
             self._announce(Status.LEARNING, '')
@@ -151,11 +169,19 @@ class TrainerNode(TeamNode):
 
     def _begin_anew_if_silent(self) -> None:
         """Begins a rollout anew when nothing of it has come for too long. A timer set anew by each message would cost more."""
-        timeout = self._training.settings.run.rollout_timeout
-        if self._state in (Status.COLLECTING, Status.EVALUATING) and time.monotonic() - self._heard_at >= timeout:
-            self.get_logger().warning(f'nothing heard for {timeout} s; missing: {self._assembler.missing()}; the rollout is '
-                                      'begun anew')
-            self._advance()
+        settings = self._training.settings.run
+        patience = min(self._patience, settings.rollout_timeout)
+        if not self._collecting or time.monotonic() - self._heard_at < patience:
+            return
+        sentence = f'nothing heard for {patience:g} s; missing: {self._assembler.missing()}'
+        self._silent_attempts += 1
+        if self._silent_attempts >= settings.max_silent_attempts:
+            raise StalledError(f'given up after {self._silent_attempts} attempts at a rollout: {sentence}')
+        self.get_logger().warning(f'{sentence}; the rollout is begun anew')
+        if patience == settings.rollout_timeout:
+            self._announce(self._state, sentence)
+        self._patience = 2 * patience  # worlds may be slow
+        self._advance()
 
     def _finish(self) -> None:
         self._announce(Status.EVALUATING, 'drawing the report')
@@ -201,7 +227,13 @@ class TrainerNode(TeamNode):
     def diagnose(self):
         training = self._training
         missing = self._missing()
-        sentence = f'waiting for {", ".join(missing)}' if missing else f'policy version {training.policy_version}'
+        silent = time.monotonic() - self._heard_at
+        if missing:
+            sentence = f'waiting for {", ".join(missing)}'
+        elif self._collecting and silent >= SHORT_PATIENCE:
+            sentence = f'nothing heard for {silent:.0f} s; missing: {self._assembler.missing()}'
+        else:
+            sentence = f'policy version {training.policy_version}'
         return sentence, {'run': f'{training.run:x}', 'environment steps': training.environment_steps,
                           'mean return': training.mean_return}
 
@@ -223,7 +255,7 @@ def help_the_leader() -> int:
         pass
     except DaeRosError as error:
         print(f'error: {error}', file=sys.stderr)
-        return 2
+        return EXIT_REFUSED
     return 0
 
 

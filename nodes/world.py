@@ -10,7 +10,7 @@ import sys
 from dae_ros_msgs import msg
 
 from dae_ros.config import GroupBinding, RunBinding, TaskSettings, check_group, declarations, from_flat
-from dae_ros.rollout.lockstep import WorldEnd
+from dae_ros.rollout.lockstep import WorldEnd, check_request
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.types import JointState, Observation, RolloutRequest
@@ -47,7 +47,7 @@ class WorldNode(TeamNode):
 
     def _on_request(self, message: msg.RolloutRequest) -> None:
         request = convert.rollout_request(message)
-        self._end.check_request(request)
+        check_request(request, self._wanted or self._end.request, self._end.run)
         self._wanted = request
         self._begin_if_ready()
 

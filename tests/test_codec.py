@@ -43,8 +43,11 @@ def encoded_checkpoint(seed=0):
 def file_of(tensors=None, architecture=SIZES, **changed):
     """A file like a policy's, with other tensors or another schema; a schema entry that is None is left out."""
     schema = {'format': codec.POLICY_FORMAT, **architecture._asdict(), **changed}
-    metadata = {'dae_ros': json.dumps({name: value for name, value in schema.items() if value is not None})}
-    return save(random_tensors(architecture) if tensors is None else tensors, metadata=metadata)
+    schema = {name: value for name, value in schema.items() if value is not None}
+    tensors = random_tensors(architecture) if tensors is None else tensors
+    signed = {name: value for name, value in schema.items() if name != 'format'}
+    checksum = codec.sha256(f'{codec.tensors_sha256(tensors)} {json.dumps(signed, sort_keys=True)}'.encode())
+    return save(tensors, metadata={'dae_ros': json.dumps({**schema, 'sha256': checksum})})
 
 
 def header_and_body(data):
@@ -153,14 +156,14 @@ def test_the_checksum_of_tensors_tells_every_change_and_no_order():
     assert codec.tensors_sha256({'x': np.array([0.0])}) != codec.tensors_sha256({'x': np.array([-0.0])})
 
 
-def test_a_checkpoint_whose_tensors_lost_a_bit_is_refused():
-    data = encoded_checkpoint()
+@both
+def test_a_file_whose_tensors_lost_a_bit_is_refused(data, decode):
     begin = len(data) - len(header_and_body(data)[1])
     for position in range(begin, len(data)):
         for bit in range(8):
             damaged = bytearray(data)
             damaged[position] ^= 1 << bit
-            assert reason_for(bytes(damaged), codec.decode_checkpoint) == 'corrupt'
+            assert reason_for(bytes(damaged), decode) == 'corrupt'
 
 
 def test_a_checkpoint_whose_facts_changed_is_refused():
@@ -178,9 +181,11 @@ def test_a_checkpoint_whose_tensors_were_exchanged_is_refused():
     assert reason_for(with_header(header, body), codec.decode_checkpoint) == 'corrupt'
 
 
-def test_a_checkpoint_without_a_checksum_is_refused():
-    metadata = {'dae_ros': json.dumps({'format': codec.CHECKPOINT_FORMAT, **FACTS})}
-    assert reason_for(save(some_tensors(), metadata=metadata), codec.decode_checkpoint) == 'corrupt'
+def test_a_file_without_a_checksum_is_refused():
+    for kind, schema, decode in ((codec.CHECKPOINT_FORMAT, FACTS, codec.decode_checkpoint),
+                                 (codec.POLICY_FORMAT, SIZES._asdict(), codec.decode_policy)):
+        metadata = {'dae_ros': json.dumps({'format': kind, **schema})}
+        assert reason_for(save(random_tensors(SIZES), metadata=metadata), decode) == 'corrupt'
 
 
 def weights(data, **changed):

@@ -225,9 +225,9 @@ def misplaced(datum, last):
     """The datum with every stamp it must not have."""
     return [
         Bad('wrong_run', stamped(datum, run=6)), Bad('wrong_run', stamped(datum, run=0)),
-        Bad('stale', stamped(datum, rollout=2)), Bad('stale', stamped(datum, rollout=2, attempt=9)),
+        Bad('stale', stamped(datum, rollout=2)), Bad('stale', stamped(datum, rollout=4, attempt=0)),
         Bad('stale', stamped(datum, attempt=0)),
-        Bad('unexpected', stamped(datum, rollout=4, attempt=0)), Bad('unexpected', stamped(datum, attempt=2)),
+        Bad('unexpected', stamped(datum, rollout=4)), Bad('unexpected', stamped(datum, rollout=2, attempt=2)),
         Bad('out_of_range', stamped(datum, step=last + 1)), Bad('out_of_range', stamped(datum, step=2**32 - 1)),
     ]
 
@@ -454,8 +454,8 @@ def test_the_world_refuses_actions_before_a_rollout_and_after_its_last_step():
 def test_the_world_begins_anew_for_a_later_request_and_for_no_other():
     world = world_at(2)
     for reason, request in [
-            ('duplicate', REQUEST), ('duplicate', REQUEST._replace(seed=12)), ('stale', REQUEST._replace(attempt=0)),
-            ('stale', REQUEST._replace(rollout=2, attempt=9)), ('wrong_run', REQUEST._replace(run=6, rollout=9)),
+            ('duplicate', REQUEST), ('duplicate', REQUEST._replace(seed=12)), ('stale', REQUEST._replace(rollout=2)),
+            ('stale', REQUEST._replace(rollout=4, attempt=0)), ('wrong_run', REQUEST._replace(run=6, rollout=9)),
             ('wrong_run', REQUEST._replace(run=0, rollout=9))]:
         refused(reason, world.on_request, request)
         assert world.request == REQUEST and world.waiting_for == [0, 1]
@@ -466,6 +466,20 @@ def test_the_world_begins_anew_for_a_later_request_and_for_no_other():
     assert_same(said, [stamped(datum, attempt=2) for datum in (OBSERVATIONS[0][0], OBSERVATIONS[1][0], STATES[0])])
     refused('stale', world.on_action, ACTIONS[1][2])
     assert world.waiting_for == [0, 1]
+
+
+def test_world_and_agent_follow_a_trainer_that_came_back_at_an_earlier_rollout_and_no_message_from_before():
+    world, agent = world_at(2), agent_with(0, 1)
+    back = REQUEST._replace(rollout=1, attempt=2)
+    assert world.on_request(back)[0].stamp.order == back.order
+    agent.on_request(back)
+    for late in (REQUEST, REQUEST._replace(rollout=9)):
+        refused('stale', world.on_request, late)
+        refused('stale', agent.on_request, late)
+    refused('stale', world.on_action, ACTIONS[0][2])
+    refused('stale', agent.on_observation, OBSERVATIONS[0][2])
+    assert world.request == agent.request == back
+    assert agent.on_observation(stamped(OBSERVATIONS[0][0], rollout=1, attempt=2)) is not None
 
 
 def test_a_world_without_a_run_joins_that_of_its_first_request_and_one_with_a_run_keeps_it():
@@ -563,7 +577,7 @@ def test_an_agent_acts_once_on_an_observation():
 
 def test_an_agent_begins_anew_for_a_later_request_and_for_no_other():
     agent = agent_with(0, 1)
-    for request in (REQUEST, REQUEST._replace(attempt=0), REQUEST._replace(rollout=2, attempt=9)):
+    for request in (REQUEST, REQUEST._replace(rollout=2), REQUEST._replace(rollout=4, attempt=0)):
         with pytest.raises(Refused) as caught:
             agent.on_request(request)
         assert caught.value.reason in ('stale', 'duplicate')

@@ -1,6 +1,8 @@
 """The folder of a run: it belongs to one set of settings and gives the newest whole checkpoint back."""
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import pytest
 
 from dae_ros import config
 from dae_ros.config import Settings
-from dae_ros.errors import RunFolderError
+from dae_ros.errors import FileError, RunFolderError
 from dae_ros.run_folder import RunFolder
 
 SETTINGS = config.from_flat({'keep_checkpoints': 3, 'beta': 0.5})
@@ -111,6 +113,32 @@ def test_the_newest_checkpoints_are_kept_and_older_ones_deleted(tmp_path, keep):
     assert newest_update(folder) is None
 
 
+def test_every_so_often_a_checkpoint_is_kept_for_good(tmp_path):
+    folder = folder_with(tmp_path, range(1, 12), config.from_flat({'keep_checkpoints': 2, 'keep_every': 4}))
+    assert sorted(int(path.stem[11:]) for path in folder.checkpoints.iterdir()) == [4, 8, 10, 11]
+
+
+def test_an_attempt_is_given_once_also_when_the_folder_is_opened_again(tmp_path):
+    given = [RunFolder(tmp_path, SETTINGS).next_attempt() for _ in range(3)]
+    folder = RunFolder(tmp_path, SETTINGS)
+    assert [*given, folder.next_attempt(), folder.next_attempt()] == [0, 1, 2, 3, 4]
+
+
+def test_a_number_of_attempts_that_cannot_be_read_is_an_error_that_names_its_file(tmp_path):
+    folder = RunFolder(tmp_path, SETTINGS)
+    (tmp_path / 'attempts').write_text('many')
+    with pytest.raises(RunFolderError, match=f'^{tmp_path}/attempts should hold the number of attempts'):
+        folder.next_attempt()
+
+
+def test_what_a_killed_trainer_left_half_written_is_removed_by_the_next(tmp_path):
+    folder = folder_with(tmp_path, [1])
+    (folder.checkpoints / '.checkpoint_00000002.safetensors.12.part').write_bytes(b'half')
+    assert newest_update(folder) == 1
+    folder.claim().close()
+    assert len(list(folder.checkpoints.iterdir())) == 1
+
+
 def test_checkpoints_are_ordered_by_number_however_many_digits_they_have(tmp_path):
     folder = folder_with(tmp_path, [9, 99_999_999, 100_000_000])
     assert newest_update(folder) == 100_000_000
@@ -144,9 +172,40 @@ def test_a_write_that_is_cut_short_leaves_the_checkpoints_there_were(tmp_path, m
         with monkeypatch.context() as patch:
             patch.setattr(step, fail)
             for update in (2, 3):
-                with pytest.raises(OSError, match='no space left'):
+                with pytest.raises(FileError, match=f'^cannot write .*_0000000{update}.safetensors: no space left'):
                     folder.save_checkpoint(update, tensors(9), {'updates': 9})
+        assert len(list(folder.checkpoints.iterdir())) == 2
         assert newest_update(RunFolder(tmp_path, SETTINGS)) == 2
+
+
+WRITER = '''
+import os, sys, time
+from pathlib import Path
+import numpy as np
+from dae_ros import config
+from dae_ros.run_folder import RunFolder
+
+def stop_here(*arguments):
+    print(flush=True)
+    time.sleep(600)
+
+folder = RunFolder(Path(sys.argv[1]), config.from_flat({'keep_checkpoints': 3, 'beta': 0.5}))
+setattr(os, sys.argv[2], stop_here)
+folder.save_checkpoint(2, {'weights': np.full((2, 3), 2, np.float32)}, {'updates': 2})
+'''
+
+
+@pytest.mark.parametrize('moment', ['fsync', 'replace'])
+def test_a_writer_killed_in_the_middle_of_a_checkpoint_leaves_the_one_before(tmp_path, moment):
+    folder = folder_with(tmp_path, [1])
+    with subprocess.Popen([sys.executable, '-c', WRITER, str(tmp_path), moment], stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b'\n'
+        writer.kill()
+    assert len(list(folder.checkpoints.iterdir())) == 2
+    again = RunFolder(tmp_path, SETTINGS)
+    again.claim().close()
+    assert newest_update(again) == 1
+    assert len(list(folder.checkpoints.iterdir())) == 1
 
 
 def test_files_of_other_names_are_not_checkpoints(tmp_path):
@@ -157,6 +216,22 @@ def test_files_of_other_names_are_not_checkpoints(tmp_path):
     assert newest_update(folder) == 1
     folder_with(tmp_path, range(2, 6))
     assert (folder.checkpoints / 'checkpoint_best.safetensors').exists()
+
+
+def test_a_folder_belongs_to_one_trainer_at_a_time(tmp_path):
+    folder, again = (RunFolder(tmp_path, SETTINGS) for _ in range(2))
+    claim = folder.claim()
+    with pytest.raises(RunFolderError, match=f'^another trainer is at work in {tmp_path}; '):
+        again.claim()
+    claim.close()
+    again.claim().close()
+
+
+def test_a_folder_that_can_only_be_read_is_an_error_that_names_it(tmp_path):
+    folder = RunFolder(tmp_path, SETTINGS)
+    (tmp_path / 'lock').mkdir()  # nobody may write here, root included
+    with pytest.raises(RunFolderError, match=f'^cannot write the run folder {tmp_path}: '):
+        folder.claim()
 
 
 def test_the_same_folder_by_another_path_is_the_same_run(tmp_path, monkeypatch):

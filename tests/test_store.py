@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dae_ros.errors import FileError
 from dae_ros.learning.policy import Policy, PolicyArchitecture
 from dae_ros.weights.codec import encode_policy
 from dae_ros.weights.store import PolicyStore
@@ -65,8 +66,9 @@ def test_a_store_that_comes_back_serves_the_newest_version(tmp_path):
     assert PolicyStore(tmp_path, 3).newest() == (4, policy_file(4))
 
 
-@pytest.mark.parametrize('damage', [lambda data: data[:-1], lambda data: b'', lambda data: data[:8] + b'[' + data[9:]],
-                         ids=['torn', 'empty', 'damaged'])
+@pytest.mark.parametrize('damage', [lambda data: data[:-1], lambda data: b'', lambda data: data[:8] + b'[' + data[9:],
+                                    lambda data: data[:-1] + bytes([data[-1] ^ 1])],
+                         ids=['torn', 'empty', 'damaged', 'a bit flipped'])
 def test_a_version_that_is_not_whole_is_passed_over_for_the_one_before(tmp_path, damage):
     store = store_with(tmp_path, [3, 4, 5])
     for version in (4, 5):
@@ -102,7 +104,15 @@ def test_a_write_that_is_cut_short_leaves_the_versions_there_were(tmp_path, monk
         with monkeypatch.context() as patch:
             patch.setattr(step, fail)
             for version in (4, 5):
-                with pytest.raises(OSError, match='no space left'):
+                with pytest.raises(FileError, match=f'^cannot write {tmp_path}/policy_0000000{version}.*: no space left'):
                     store.save(version, b'half of a pol')
+        assert len(list(tmp_path.iterdir())) == 2
         assert PolicyStore(tmp_path, 3).versions() == [3, 4]
         assert PolicyStore(tmp_path, 3).newest() == (4, policy_file(4))
+
+
+def test_a_store_that_comes_back_removes_what_a_killed_one_left_half_written(tmp_path):
+    store_with(tmp_path, [3])
+    (tmp_path / '.policy_00000004.safetensors.123.part').write_bytes(b'half of a pol')
+    PolicyStore(tmp_path, 3)
+    assert len(list(tmp_path.iterdir())) == 1

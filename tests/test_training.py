@@ -1,18 +1,20 @@
 """A training in one process: the same settings give the same weights, also when it was interrupted in between."""
 
 import math
+import threading
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies
 
 from dae_ros import config
+from dae_ros.errors import FileError
 from dae_ros.report.metrics import read_metrics
 from dae_ros.rollout.in_process import InProcessCollector, train
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training, episode_returns
 from dae_ros.types import Trajectory
-from dae_ros.weights.codec import decode_policy, encode_policy
+from dae_ros.weights.codec import decode_policy, encode_policy, tensors_sha256
 from dae_ros.worlds import make_worlds, world_spec
 
 UPDATES = 5
@@ -185,7 +187,15 @@ def test_a_rollout_asked_for_twice_is_the_next_attempt_of_the_same_rollout(begin
     assert first == second._replace(attempt=0) == third._replace(attempt=0)
     assert run.collect().attempt == 3
     request = run.training.request()
-    assert (request.rollout, request.attempt, request.policy_version) == (1, 0, 1)
+    assert (request.rollout, request.attempt, request.policy_version) == (1, 3, 1)
+
+
+def test_a_training_that_comes_back_at_an_earlier_rollout_supersedes_what_it_asked_for_before(begin):
+    killed = begin(NAVIGATION, 'disturbed').train(stop_after=3)
+    before = killed.training.request()
+    after = begin(NAVIGATION, 'disturbed').training.request()
+    assert (before.rollout, after.rollout) == (3, 2)
+    assert after.order > before.order
 
 
 @pytest.mark.parametrize('greedy', [True, False])
@@ -281,9 +291,57 @@ def test_checkpoints_are_written_at_their_interval_and_at_the_end(begin):
     updates = []
     while not run.training.finished:
         run.collect()
-        found = run.folder.newest_checkpoint()
-        updates.append(None if found is None else found[1]['updates'])
-    assert updates == [None, 2, 2, 4, 5, 5, 5]
+        found = sorted(int(path.stem[11:]) for path in run.folder.checkpoints.glob('checkpoint_*'))
+        updates.append(found)
+    run.training.close()
+    assert updates[-1] == [2, 4, 5]
+    assert all(update in (2, 4, 5) for found in updates for update in found)
+
+
+def test_the_last_checkpoint_is_whole_before_the_evaluation_begins_and_any_other_when_the_training_is_closed(begin):
+    run = begin(NAVIGATION)
+    while not run.training.evaluating:
+        run.collect()
+    assert run.folder.newest_checkpoint()[1]['updates'] == UPDATES
+    stopped = begin(NAVIGATION).train(stop_after=2)
+    assert stopped.folder.newest_checkpoint()[1]['updates'] == 2
+
+
+def test_a_checkpoint_holds_the_training_as_it_was_however_late_it_is_written(begin, monkeypatch):
+    writing, released = [], threading.Event()
+    save_checkpoint = RunFolder.save_checkpoint
+
+    def late(*arguments):
+        writing.append(arguments)
+        assert released.wait(60)
+        save_checkpoint(*arguments)
+
+    run, undelayed = (begin(NAVIGATION, checkpoint_interval=1) for _ in range(2))
+    undelayed.collect()
+    weights = undelayed.training.weights_sha256()
+    monkeypatch.setattr(RunFolder, 'save_checkpoint', late)
+    run.collect()
+    trajectory = InProcessCollector(make_worlds(run.settings.task)).collect(run.training.request(), run.training.policy)
+    run.training._learner.update(trajectory, 1)
+    assert run.training.weights_sha256() != weights
+    released.set()
+    run.training.close()
+    assert tensors_sha256(run.folder.newest_checkpoint()[0]) == weights
+
+
+def test_a_checkpoint_that_cannot_be_written_ends_the_training_with_an_error_that_names_it(begin, monkeypatch):
+    def full(*_):
+        raise OSError(28, 'No space left on device')
+
+    run = begin(NAVIGATION, checkpoint_interval=1)
+    with monkeypatch.context() as patch:
+        patch.setattr('os.fsync', full)
+        run.collect()
+        with pytest.raises(FileError, match='checkpoint_00000001.safetensors: No space left on device'):
+            run.training.save()
+    assert not any(run.folder.checkpoints.iterdir())
+    run.training.save()
+    assert run.folder.newest_checkpoint()[1]['updates'] == 1
 
 
 def test_the_trained_policy_is_left_as_a_file(undisturbed):
@@ -295,7 +353,7 @@ def test_the_trained_policy_is_left_as_a_file(undisturbed):
 
 
 def test_a_finished_training_opened_again_learns_nothing_more_and_is_evaluated_anew(begin, undisturbed):
-    begin(NAVIGATION, 'finished').train()
+    begin(NAVIGATION, 'finished').train().training.close()
     again = begin(NAVIGATION, 'finished')
     assert again.training.evaluating and not again.training.finished
     assert_same_end(again.train(), undisturbed(NAVIGATION))

@@ -28,15 +28,22 @@ def check_run(run: int, own_run: int) -> None:
         raise Refused(Refused.WRONG_RUN, f'run {run:x}, this node belongs to run {own_run:x}')
 
 
+def check_request(request: RolloutRequest, latest: RolloutRequest | None, own_run: int) -> None:
+    """Refuses a request of another run, or one that the latest request taken in has superseded."""
+    check_run(request.run, own_run)
+    if latest is not None and request.order <= latest.order:
+        raise Refused(Refused.DUPLICATE if request.order == latest.order else Refused.STALE,
+                      f'request for {request.order}, the latest was for {latest.order}')
+
+
 def check_stamp(stamp: Stamp, request: RolloutRequest | None, own_run: int) -> None:
     """Refuses a stamp that is not of the rollout under way."""
     check_run(stamp.run, own_run)
     if request is None:
         raise Refused(Refused.UNEXPECTED, f'rollout {stamp.rollout}, but none was requested yet')
-    asked, given = (request.rollout, request.attempt), (stamp.rollout, stamp.attempt)
-    if given != asked:
-        raise Refused(Refused.STALE if given < asked else Refused.UNEXPECTED,
-                      f'rollout {given[0]} attempt {given[1]}, under way is rollout {asked[0]} attempt {asked[1]}')
+    if stamp.order != request.order:
+        raise Refused(Refused.STALE if stamp.order < request.order else Refused.UNEXPECTED,
+                      f'{stamp.order}, under way is {request.order}')
 
 
 def check_action(action: Action, num_agents: int, num_worlds: int, num_actions: int, policy_version: int) -> None:
@@ -80,17 +87,9 @@ class WorldEnd:
             return []
         return [robot for robot in range(self._worlds.spec.num_agents) if robot not in self._actions]
 
-    def check_request(self, request: RolloutRequest) -> None:
-        """Refuses a request of another run, or one that a later request has superseded."""
-        check_run(request.run, self.run)
-        if self.request is not None:
-            asked, under_way = (request.rollout, request.attempt), (self.request.rollout, self.request.attempt)
-            if asked <= under_way:
-                raise Refused(Refused.DUPLICATE if asked == under_way else Refused.STALE, f'request for rollout {asked[0]}')
-
     def on_request(self, request: RolloutRequest) -> list[WorldDatum]:
         """Begins a rollout, or begins it anew; the data of its first step."""
-        self.check_request(request)
+        check_request(request, self.request, self.run)
         self.run, self.request, self._step = request.run, request, 0
         self._actions = {}
         return self._show(self._worlds.reset(draws.group_seed(request.seed, self._group), request.rollout))
@@ -160,15 +159,13 @@ class AgentEnd:
 
     def on_request(self, request: RolloutRequest) -> Action | None:
         """Takes note of the rollout under way."""
-        check_run(request.run, self.run)
-        if self.request is not None and (request.rollout, request.attempt) <= (self.request.rollout, self.request.attempt):
-            raise Refused(Refused.STALE, f'request for rollout {request.rollout} attempt {request.attempt}')
+        check_request(request, self.request, self.run)
         self.run, self.request, self._next_step, self._state, self._pending = request.run, request, 0, None, None
-        early, asked = self._early, (request.rollout, request.attempt)
-        if early is None or (early.stamp.rollout, early.stamp.attempt) > asked:
+        early = self._early
+        if early is None or early.stamp.order > request.order:
             return None
         self._early = None
-        return self.on_observation(early) if (early.stamp.rollout, early.stamp.attempt) == asked else None
+        return self.on_observation(early) if early.stamp.order == request.order else None
 
     def on_policy(self, version: int, policy: Policy) -> Action | None:
         """Takes in one version of the policy; the two newest and the one in use are kept."""
@@ -190,7 +187,7 @@ class AgentEnd:
         if not np.isfinite(observation.values).all():
             raise Refused(Refused.NOT_FINITE, 'an observation is not a finite number')
         request = self.request
-        if request is None or (stamp.rollout, stamp.attempt) > (request.rollout, request.attempt):
+        if request is None or stamp.order > request.order:
             self._early = observation
             return None
         check_stamp(stamp, request, self.run)

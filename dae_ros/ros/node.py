@@ -20,6 +20,7 @@ from rclpy.timer import Timer
 
 from dae_ros.config import SettingInfo
 from dae_ros.errors import DaeRosError, Refused
+from dae_ros.restarts import EXIT_REFUSED
 from dae_ros.ros import names, params, qos
 
 try:
@@ -35,7 +36,7 @@ class TeamNode(Node):
     """A node of the team's graph.
 
     Subclasses take what they need from `settings`, call `listen` and `publisher`, and may override `on_matched`, called
-    whenever an endpoint of theirs found or lost a partner, and `diagnose`.
+    whenever an endpoint of theirs found or lost a partner, `on_new_source` and `diagnose`.
     """
 
     def __init__(self, name: str, declared: Iterable[SettingInfo]):
@@ -61,7 +62,12 @@ class TeamNode(Node):
             except Refused as refusal:
                 self.refuse(topic, refusal)
 
-        callbacks = SubscriptionEventCallbacks(matched=self._guarded(lambda _: self.on_matched()))
+        def match(change) -> None:
+            if change.total_count_change > 0:
+                self.on_new_source()
+            self.on_matched()
+
+        callbacks = SubscriptionEventCallbacks(matched=self._guarded(match))
         return self.create_subscription(kind, topic, self._guarded(receive), profile, event_callbacks=callbacks)
 
     def every(self, period: float, act: Callable[[], None]) -> Timer:
@@ -89,6 +95,9 @@ class TeamNode(Node):
 
     def on_matched(self) -> None:
         """An endpoint found or lost a partner."""
+
+    def on_new_source(self) -> None:
+        """Somebody new publishes what this node listens to: a node that has just started, perhaps in place of one that died."""
 
     def diagnose(self) -> tuple[str, dict[str, Any]]:
         """One sentence on what the node is doing, and values worth showing."""
@@ -124,35 +133,38 @@ def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int
     signal.signal(signal.SIGINT, interrupt)  # rclpy's handler, which shuts the context down, calls this one
     rclpy.init(args=args)
     try:
-        node = make_node()
-        executor = Executor()
-        executor.add_node(node)
-        # What start-up made lives as long as the node. Unfrozen, the garbage collector goes through all of it again and
-        # again, a quarter of an agent's time, since every message makes a few objects.
-        gc.collect()
-        gc.freeze()
-        while not node.done and node.context.ok():
-            executor.spin_once(LONG)
-            if node.failure is not None:
-                raise node.failure
-        return 0
+        try:
+            node = make_node()
+            executor = Executor()
+            executor.add_node(node)
+            # What start-up made lives as long as the node. Unfrozen, the garbage collector goes through all of it again and
+            # again, a quarter of an agent's time, since every message makes a few objects.
+            gc.collect()
+            gc.freeze()
+            while not node.done and node.context.ok():
+                executor.spin_once(LONG)
+                if node.failure is not None:
+                    raise node.failure
+            return 0
+        except RuntimeError:
+            # What rclpy raises when a callback still publishes after a signal has shut the context down.
+            if rclpy.ok():
+                raise
+            return 0
+        finally:
+            # A terminal and a launch file each send their own Ctrl-C: the second must not break into the cleaning up.
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
+            if executor is not None:
+                executor.shutdown()
+            if node is not None:
+                try:
+                    node.close()
+                finally:
+                    node.destroy_node()
+            rclpy.try_shutdown()
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except DaeRosError as error:
         print(f'error: {error}', file=sys.stderr)
-        return 2
-    except RuntimeError:
-        # What rclpy raises when a callback still publishes after a signal has shut the context down.
-        if rclpy.ok():
-            raise
-        return 0
-    finally:
-        # A terminal and a launch file each send their own Ctrl-C: the second must not break into the cleaning up.
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
-        if executor is not None:
-            executor.shutdown()
-        if node is not None:
-            node.close()
-            node.destroy_node()
-        rclpy.try_shutdown()
+        return EXIT_REFUSED

@@ -42,6 +42,12 @@ class Supervisor:
         threading.Thread(target=self._watch, args=(name, process), daemon=True).start()
         return process.pid
 
+    def kill(self, name: str) -> None:
+        """Ends a process that would not end by itself."""
+        process = self._processes[name]
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+
     def log_file(self, name: str) -> Path:
         """Where the process's output goes."""
         return self._log_folder / f'{name}.log'

@@ -73,24 +73,21 @@ def decode_policy(data: bytes) -> Policy:
 
 def encode_checkpoint(tensors: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> bytes:
     """A checkpoint file: tensors by name, and facts (JSON values) about the run."""
-    return _encode(CHECKPOINT_FORMAT, tensors, {**facts, 'sha256': _checkpoint_sha256(tensors, facts)})
+    return _encode(CHECKPOINT_FORMAT, tensors, facts)
 
 
 def decode_checkpoint(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors and facts of a checkpoint file. Raises Refused if it is torn, corrupted or something else."""
-    tensors, facts = _decode(CHECKPOINT_FORMAT, data)
-    if facts.pop('sha256', None) != _checkpoint_sha256(tensors, facts):
-        raise Refused(Refused.CORRUPT, 'the checksum does not match')
-    return tensors, facts
+    return _decode(CHECKPOINT_FORMAT, data)
 
 
-def _checkpoint_sha256(tensors: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> str:
-    return sha256(f'{tensors_sha256(tensors)} {json.dumps(facts, sort_keys=True)}'.encode())
+def _checksum(tensors: Mapping[str, np.ndarray], schema: Mapping[str, Any]) -> str:
+    return sha256(f'{tensors_sha256(tensors)} {json.dumps(schema, sort_keys=True)}'.encode())
 
 
 def _encode(file_format: str, tensors: Mapping[str, np.ndarray], schema: Mapping[str, Any]) -> bytes:
     # One metadata key, because safetensors writes several in no fixed order.
-    metadata = {'dae_ros': json.dumps({'format': file_format, **schema}, sort_keys=True)}
+    metadata = {'dae_ros': json.dumps({'format': file_format, **schema, 'sha256': _checksum(tensors, schema)}, sort_keys=True)}
     return save({name: np.asarray(tensor, order='C') for name, tensor in tensors.items()}, metadata=metadata)
 
 
@@ -105,6 +102,8 @@ def _decode(file_format: str, data: bytes) -> tuple[dict[str, np.ndarray], dict[
         raise Refused(Refused.CORRUPT, f'not a {file_format} file: {_short(error)}') from error
     if found != file_format:
         raise Refused(Refused.CORRUPT, f'format {_short(found)}, expected {file_format}')
+    if schema.pop('sha256', None) != _checksum(tensors, schema):
+        raise Refused(Refused.CORRUPT, 'the checksum does not match')
     return tensors, schema
 
 

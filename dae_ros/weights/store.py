@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dae_ros.errors import Refused
-from dae_ros.files import write_atomically
+from dae_ros.files import remove_unfinished, write_atomically
 from dae_ros.weights.codec import decode_policy
 
 _SUFFIX = '.safetensors'
@@ -18,6 +18,7 @@ class PolicyStore:
         self._folder = folder
         self._keep = keep
         folder.mkdir(parents=True, exist_ok=True)
+        remove_unfinished(folder)
 
     def versions(self) -> list[int]:
         """Versions on disk, oldest first."""

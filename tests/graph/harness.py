@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -42,6 +43,7 @@ class Graph:
         self._namespace = namespace
         self.processes = {process.name: process for process in training_graph(settings, self.folder)}
         self._codes: dict[str, int] = {}
+        self.pids: dict[str, int] = {}
         self._supervisor = Supervisor(path / 'logs', self._codes.__setitem__)
 
     @property
@@ -53,7 +55,14 @@ class Graph:
             process = self.processes[name]
             command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
                        *process.arguments(self.folder.settings_file, self._namespace)]
-            self._supervisor.start(name, command, os.environ)
+            self.pids[name] = self._supervisor.start(name, command, os.environ)
+
+    def kill(self, *names: str) -> None:
+        """Kills nodes that were started; they are gone when this returns."""
+        for name in names:
+            os.kill(self.pids[name], signal.SIGKILL)
+        for name in names:
+            self.wait(name)
 
     def wait(self, name: str = 'trainer') -> int:
         """The exit code of a node that ends by itself."""
@@ -105,6 +114,18 @@ def processes_naming(text: str) -> list[str]:
         if text in line and int(entry.name) != os.getpid():
             lines.append(line)
     return lines
+
+
+def pid_of(node: str, folder: Path) -> int | None:
+    """The process of a node of the run that lies below `folder`; None where it is not running."""
+    for entry in Path('/proc').iterdir():
+        try:
+            arguments = (entry / 'cmdline').read_bytes().decode(errors='replace').split('\0')
+        except (OSError, NotADirectoryError):
+            continue
+        if f'__node:={node}' in arguments and any(str(folder) in argument for argument in arguments):
+            return int(entry.name)
+    return None
 
 
 class Listener:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import select
 import signal
-import subprocess
 
 import pytest
-from harness import SMALL, TIMEOUT, Listener, bringup, finish, oracle, processes_naming
+from harness import SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of, processes_naming
 
 from dae_ros.report.metrics import read_metrics
 from dae_ros.report.summary import Summary
@@ -17,9 +16,9 @@ LONG = {**SMALL, 'total_steps': 10**7}
 
 
 @pytest.fixture
-def long_run(domain, tmp_path):
-    """A run that would take hours, seen to be learning."""
-    process = bringup(tmp_path / 'run', LONG)
+def long_run(request, domain, tmp_path):
+    """A run that would take hours, seen to be learning; with other settings by indirect parameters."""
+    process = bringup(tmp_path / 'run', {**LONG, **getattr(request, 'param', {})})
     try:
         with Listener() as listener:
             listener.wait_for_status(lambda status: status.policy_version >= 1)
@@ -29,14 +28,27 @@ def long_run(domain, tmp_path):
         process.communicate(timeout=TIMEOUT)
 
 
+@pytest.mark.parametrize('long_run', [{'max_restarts': 0}], indirect=True)
 @pytest.mark.parametrize('node', ['world', 'agent_1', 'parameter_server', 'trainer'])
-def test_a_node_that_dies_ends_the_run_with_its_name_and_no_process_left(node, long_run, tmp_path):
+def test_a_node_that_dies_too_often_ends_the_run_with_its_name_and_no_process_left(node, long_run, tmp_path):
     pid = pid_of(node, tmp_path)
     os.kill(pid, signal.SIGKILL)
     code, _, errors = finish(long_run)
     assert code == 2
-    assert f'{node} ended with exit code -9' in errors
+    assert f'{node} was killed by SIGKILL' in errors
     assert 'Traceback' not in errors
+    assert not processes_naming(str(tmp_path))
+
+
+@pytest.mark.parametrize('long_run', [{'max_restarts': 2}], indirect=True)
+def test_a_node_that_is_started_again_and_refuses_to_run_ends_the_run_with_what_it_said(long_run, tmp_path):
+    (tmp_path / 'run' / 'attempts').write_text('damaged')
+    os.kill(pid_of('trainer', tmp_path), signal.SIGKILL)
+    code, output, errors = finish(long_run)
+    assert code == 2
+    assert 'trainer was killed by SIGKILL and is started again' in output
+    assert 'trainer ended with exit code 2' in errors and 'attempts should hold the number of attempts' in errors
+    assert 'Traceback' not in output + errors
     assert not processes_naming(str(tmp_path))
 
 
@@ -88,12 +100,6 @@ def test_a_wrong_setting_is_one_sentence_before_anything_starts(arguments, sente
     assert code == 2
     assert sentence in errors and len(errors.strip().splitlines()) == 1
     assert not (tmp_path / 'run').exists()
-
-
-def pid_of(node: str, tmp_path) -> int:
-    pattern = f'__node:={node} .*{tmp_path}' if node in ('parameter_server', 'trainer') else f'{tmp_path}.*__node:={node} '
-    found = subprocess.run(['pgrep', '-f', pattern], capture_output=True, text=True, check=True)
-    return int(found.stdout.split()[0])
 
 
 def wait_until_gone(pid: int) -> None:

@@ -1,0 +1,158 @@
+"""Whatever is killed, whenever: the run ends with the weights of the run that nothing disturbed, bit for bit.
+
+`make chaos` kills more often: CHAOS_KILLS says how often, CHAOS_SEED whom and when.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import time
+
+import pytest
+from dae_ros_msgs.msg import PolicyWeights, TrainingStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from harness import SMALL, Listener, bringup, finish, oracle, pid_of, processes_naming
+
+from dae_ros.report.metrics import read_metrics
+from dae_ros.report.summary import Summary
+from dae_ros.ros import names, qos
+from dae_ros.weights.codec import decode_policy
+
+AGENTS = ('agent_0', 'agent_1', 'agent_2')
+NODES = ('world', *AGENTS, 'parameter_server', 'trainer')
+UPDATES = 40
+VALUES = {**SMALL, 'total_steps': UPDATES * 8 * 25}
+KILLS = int(os.environ.get('CHAOS_KILLS', 5))
+SEED = int(os.environ.get('CHAOS_SEED', 1))
+
+
+@pytest.fixture(scope='module')
+def undisturbed(tmp_path_factory):
+    """SHA-256 of the final weights and mean return of the evaluation, by number of updates."""
+    results = {}
+
+    def find(updates: int) -> tuple[str, float]:
+        if updates not in results:
+            results[updates] = oracle(tmp_path_factory.mktemp('alone') / 'run', {**VALUES, 'total_steps': updates * 8 * 25})
+        return results[updates]
+
+    return find
+
+
+class Disturbed:
+    """A training by bringup whose nodes a test kills."""
+
+    def __init__(self, folder, updates: int, changed: dict):
+        self.folder, self.updates = folder, updates
+        self.process = bringup(folder, {**VALUES, 'total_steps': updates * 8 * 25, **changed})
+
+    def kill(self, *nodes: str, by: int = signal.SIGKILL) -> list[str]:
+        """Kills those of the nodes that run, or sends them another signal; their names."""
+        found = {node: pid for node in nodes if (pid := pid_of(node, self.folder)) is not None}
+        for pid in found.values():
+            os.kill(pid, by)
+        return list(found)
+
+    def assert_ends_with(self, expected: tuple[str, float]) -> str:
+        """The run ends by itself with this result and leaves everything it should and no process; what it said."""
+        code, output, errors = finish(self.process)
+        logs = {path.stem: path.read_text() for path in (self.folder / 'logs').iterdir()}
+        assert code == 0, output + errors + '\n'.join(f'--- {name}\n{log[-3000:]}' for name, log in logs.items())
+        summary = Summary.read(self.folder / 'summary.json')
+        assert (summary.weights_sha256, summary.evaluation_return) == expected
+        assert 'Traceback' not in output + errors + ''.join(logs.values())
+        assert list(read_metrics(self.folder / 'metrics.csv')['environment_steps']) == [
+            200 * (update + 1) for update in range(self.updates)]
+        assert not processes_naming(str(self.folder))
+        return output
+
+
+@pytest.fixture
+def disturb(domain, tmp_path):
+    """Begins such trainings, and ends what is left of them."""
+    runs: list[Disturbed] = []
+
+    def begin(updates: int = UPDATES, **changed) -> Disturbed:
+        runs.append(Disturbed(tmp_path / f'run_{len(runs)}', updates, changed))
+        return runs[-1]
+
+    yield begin
+    for run in runs:
+        run.process.kill()
+        run.process.communicate()
+
+
+def victims(kills: int, draw: random.Random) -> list[tuple[str, ...]]:
+    """Whom to kill at once, as often: each kind of node, the trainer twice in a row, and then anyone, sometimes two."""
+    first = [('world',), (draw.choice(AGENTS),), ('parameter_server',), ('trainer',), ('trainer',)]
+    anyone = [tuple(draw.sample(NODES, draw.choice((1, 1, 2)))) for _ in range(kills - len(first))]
+    return (first + anyone)[:kills]
+
+
+def test_the_run_ends_with_the_same_weights_whoever_is_killed_whenever(disturb, undisturbed):
+    """Kills when the training has come to versions drawn at random, and a moment later."""
+    draw = random.Random(SEED)
+    updates = max(UPDATES, 8 * KILLS)
+    run, killed = disturb(updates), []
+    with Listener() as listener:
+        moments = sorted(draw.sample(range(updates - 3), KILLS - 1))
+        for version, nodes in zip([*moments, updates], victims(KILLS, draw)):  # the last one while it is evaluated
+            listener.wait_for_status(lambda status: status.policy_version >= version)
+            time.sleep(draw.uniform(0, 0.3))
+            killed += run.kill(*nodes) or run.kill('trainer')  # which has just spoken
+    print(f'{len(killed)} killed in {updates} updates: {", ".join(killed)}')
+    assert len(killed) >= KILLS
+    run.assert_ends_with(undisturbed(updates))
+
+
+def test_the_server_serves_from_disk_before_a_trainer_is_back_that_lost_its_newest_checkpoint(make_graph, undisturbed, tmp_path):
+    graph = make_graph(tmp_path / 'run', VALUES)
+    graph.start(*graph.names)
+    with Listener() as listener:
+        listener.wait_for_status(lambda status: status.policy_version >= 6)
+        graph.kill('trainer', 'parameter_server')
+        *_, before, newest = sorted(graph.folder.checkpoints.glob('checkpoint_*'))
+        newest.write_bytes(newest.read_bytes()[:-100])
+        served: list[PolicyWeights] = []
+        told: list[TrainingStatus] = []
+        listener.node.create_subscription(PolicyWeights, names.POLICY, served.append, qos.LATCHED_INPUT)
+        listener.node.create_subscription(TrainingStatus, names.TRAINING_STATUS, told.append, qos.LATCHED_INPUT)
+        graph.start('parameter_server')
+        listener.spin_until(lambda: bool(served))
+        assert served[0].version >= 5 and len(decode_policy(bytes(served[0].data)).tensors)
+        graph.start('trainer')
+        listener.spin_until(lambda: bool(told))
+        assert f'checkpoint_{told[0].policy_version:08d}' == before.stem
+    assert graph.wait() == 0, graph.log('trainer')
+    assert graph.result() == undisturbed(UPDATES)
+
+
+def test_a_node_that_is_alive_but_silent_is_replaced_and_named(disturb, undisturbed):
+    run, told = disturb(silence_timeout=15.0), []
+    with Listener() as listener:
+        listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, lambda report: told.extend(report.status),
+                                          qos.EVENTS)
+        listener.wait_for_status(lambda status: status.policy_version >= 3)
+        assert run.kill('agent_1', by=signal.SIGSTOP)
+        sentence = 'agent_1 has said nothing for 15 s and is killed'
+        listener.spin_until(lambda: any((status.name, status.message) == ('/agent_1', sentence) for status in told))
+    assert sentence in run.assert_ends_with(undisturbed(UPDATES))
+
+
+def test_a_trainer_whom_nobody_answers_says_so_and_gives_up_with_everything_saved(make_graph, undisturbed, tmp_path):
+    values = {**VALUES, 'rollout_timeout': 1.0, 'max_silent_attempts': 4}
+    graph = make_graph(tmp_path / 'run', values)
+    graph.start(*graph.names)
+    with Listener() as listener:
+        listener.wait_for_status(lambda status: status.policy_version >= 3)
+        os.kill(graph.pids['world'], signal.SIGSTOP)
+        listener.wait_for_status(lambda status: status.detail.startswith('nothing heard for 1 s; missing: '))
+    assert graph.wait('trainer') == 2
+    assert 'error: given up after 4 attempts at a rollout: nothing heard for 1 s' in graph.log('trainer')
+    assert 'Traceback' not in graph.log('trainer')
+    os.kill(graph.pids['world'], signal.SIGCONT)
+    graph.start('trainer')
+    assert graph.wait('trainer') == 0, graph.log('trainer')
+    assert graph.result() == undisturbed(UPDATES)
