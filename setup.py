@@ -18,7 +18,7 @@ setup(
         ('share/dae_ros/launch', sorted(glob('launch/*.py'))),
     ],
     python_requires='>=3.10',
-    install_requires=['matplotlib', 'numpy', 'pillow', 'pyyaml', 'rich', 'safetensors', 'tensorboard', 'torch'],
+    install_requires=['matplotlib', 'numpy', 'pillow', 'pyyaml', 'rich', 'rosbags', 'safetensors', 'tensorboard', 'torch'],
     zip_safe=False,
     author='dae_ros maintainers',
     author_email='dae_ros@example.org',
