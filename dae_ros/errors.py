@@ -23,6 +23,10 @@ class RunFolderError(DaeRosError):
     """A run's folder cannot be used: it holds another run, or cannot be written."""
 
 
+class BagError(DaeRosError):
+    """A bag cannot be read or written: it is not there, not a bag, or of messages that are not ours."""
+
+
 class Refused(DaeRosError):
     """A message from outside that is not acted on.
 
