@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,12 @@ SCHEMAS = Path(__file__).parents[1] / 'msg_schemas' / 'msg'
 RUN = 7
 
 
-def typestore(change=lambda text: text):
+def unchanged(text):
+    return text
+
+
+@functools.lru_cache
+def typestore(change=unchanged):
     """Our message types as they stand in msg_schemas, each definition passed through `change`."""
     store = get_typestore(Stores.EMPTY)
     for path in sorted(SCHEMAS.glob('*.msg')):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import glob
 import re
 import shutil
@@ -143,6 +144,7 @@ def _wanted(name: str, encoding: str, definition: str) -> bool:
     return True
 
 
+@functools.lru_cache
 def _rihs01(name: str, encoding: str, definition: str) -> str:
     """REP 2011's hash of a definition, '' of one that nobody understands."""
     store = get_typestore(Stores.EMPTY)
