@@ -106,7 +106,7 @@ class Bag:
                             self._damage[mcap.CORRUPT] += 1
         except (sqlite3.Error, UnicodeDecodeError) as error:
             if not begun:
-                raise BagError(f'not an sqlite3 bag: {error}') from error
+                raise BagError(f'not an sqlite3 bag: {ascii(str(error))[:200]}') from error
             self._damage[mcap.TRUNCATED] += 1
 
     def _unpacked(self, messages: Iterator[Message]) -> Iterator[Message]:
