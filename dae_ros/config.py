@@ -168,6 +168,21 @@ class ParameterServerSettings:
 
 
 @dataclass(frozen=True)
+class RecorderSettings:
+    """What is particular to the recorder."""
+
+    bag: str = setting('', 'folder of the bag, which must not exist yet; empty takes bags/<time>. Where it is split, _0, _1, ... '
+                           'follow the name')
+    storage: str = setting('mcap', 'format of the bag', choices=('mcap', 'sqlite3'))
+    compression: str = setting('none', 'compression of the bag', choices=('none', 'zstd'))
+    split_megabytes: int = setting(0, 'a new bag is begun after so much data, before compression; 0 for never', unit='MB',
+                                   minimum=0, maximum=1_000_000_000)
+    split_seconds: int = setting(0, 'a new bag is begun after this long; 0 for never', unit='s', minimum=0, maximum=1_000_000_000)
+    everything: bool = setting(False, 'also record observations and policies, which neither a replay to a trainer nor reward '
+                                      'training needs')
+
+
+@dataclass(frozen=True)
 class TrainerSettings:
     """What is particular to the trainer."""
 

@@ -139,13 +139,13 @@ def _wanted(name: str, encoding: str, definition: str) -> bool:
     """A `mcap.Accept`: our types, if their definitions are ours. Raises BagError if they are not."""
     if name not in MESSAGE_TYPES:
         return False
-    if definition and _rihs01(name, encoding, definition) != MESSAGE_TYPES[name].rihs01:
+    if definition and rihs01(name, encoding, definition) != MESSAGE_TYPES[name].rihs01:
         raise BagError(f'it was recorded with another version of {name} than this package reads')
     return True
 
 
 @functools.lru_cache
-def _rihs01(name: str, encoding: str, definition: str) -> str:
+def rihs01(name: str, encoding: str, definition: str) -> str:
     """REP 2011's hash of a definition, '' of one that nobody understands."""
     store = get_typestore(Stores.EMPTY)
     try:
