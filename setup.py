@@ -15,6 +15,7 @@ setup(
         ('share/ament_index/resource_index/packages', ['resource/dae_ros']),
         ('share/dae_ros', ['package.xml']),
         ('share/dae_ros/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        ('share/dae_ros/config/bags', sorted(glob('config/bags/*.yaml'))),
         ('share/dae_ros/launch', sorted(glob('launch/*.py'))),
     ],
     python_requires='>=3.10',
