@@ -190,6 +190,19 @@ class TrainerSettings:
                                   'runs/<task>_n<robots>_seed<seed>. A folder with a checkpoint of the same run resumes it')
 
 
+@dataclass(frozen=True)
+class RewardTrainingSettings:
+    """How a reward network is trained from bags. Only train_reward needs it, beside those of the reward network."""
+
+    held_out: float = setting(0.1, 'share of the episodes that are not learnt from but measured on', minimum=0.001, maximum=0.999)
+    max_epochs: int = setting(100, 'most passes over the bags', unit='epochs', minimum=1, maximum=1_000_000)
+    patience: int = setting(5, 'passes without a smaller held-out error after which it ends', unit='epochs', minimum=1,
+                            maximum=1_000_000)
+    batch_chunks: int = setting(64, 'chunks of a gradient step', unit='chunks', minimum=1, maximum=1_000_000)
+    pool_chunks: int = setting(4096, 'chunks held in memory and mixed with each other', unit='chunks', minimum=1,
+                               maximum=100_000_000)
+
+
 NESTED_GROUPS = ('reward_network',)
 
 

@@ -93,7 +93,7 @@ class DifferenceEstimator:
                                                  settings.gae_lambda)
         estimated = team.unsqueeze(-1).expand(data.actions.shape)
         if self._reward:
-            remembered = self._remembered(data)
+            remembered = as_remembered(data, self._reward_settings)
             predicted, inputs, states = self._predicted_rewards(remembered)
             expected = advantages.expected_rewards(predicted, data.probabilities)
             estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
@@ -117,7 +117,8 @@ class DifferenceEstimator:
         """E over a_i ~ pi_i of the predicted reward, [T, W, N]. Raises ValueError at beta = 0, which has no reward network."""
         if not self._reward:
             raise ValueError('at beta = 0 there is no reward network')
-        return advantages.expected_rewards(self._predicted_rewards(self._remembered(data))[0], data.probabilities)
+        predicted, _, _ = self._predicted_rewards(as_remembered(data, self._reward_settings))
+        return advantages.expected_rewards(predicted, data.probabilities)
 
     def networks(self) -> dict[str, FlatAdam]:
         return {'critic': self._critic} | {member.name: member.adam for member in self._reward}
@@ -139,12 +140,6 @@ class DifferenceEstimator:
             ongoing = torch.zeros(1, len(data.final_states), dtype=torch.bool, device=outputs.device)
             final_values = critic(data.final_states[None, :, None], hidden[:-1][data.truncated], ongoing)[0].view(-1)
         return outputs.flatten(1), hidden, final_values
-
-    def _remembered(self, data: Trajectory) -> Trajectory:
-        """The rollout as far as the reward networks remember it: without memory, every step begins an episode."""
-        if self._reward_settings.recurrent:
-            return data
-        return data._replace(episode_start=torch.ones_like(data.episode_start))
 
     def _predicted_rewards(self, data: Trajectory) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The ensemble's mean prediction [T, W, N, A], what it is made from, and each member's recurrent states."""
@@ -233,6 +228,11 @@ class CounterfactualEstimator:
 
 
 ESTIMATORS = {'dae': DifferenceEstimator, 'coma': CounterfactualEstimator, 'coma_nstep': CounterfactualEstimator}
+
+
+def as_remembered(data: Trajectory, settings: RewardNetworkSettings) -> Trajectory:
+    """The rollout as far as reward networks remember it: without memory, every step begins an episode."""
+    return data if settings.recurrent else data._replace(episode_start=torch.ones_like(data.episode_start))
 
 
 def chunk_length(data: Trajectory, settings: LearnerSettings) -> int:
