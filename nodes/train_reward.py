@@ -66,8 +66,8 @@ def train(dataset: Dataset, arguments: argparse.Namespace, console: Console) -> 
                                   lambda done, total: progress.update(bar, completed=done, total=total or None))
         try:
             baseline, skipped, epochs = training.baseline, dataset.describe_skipped(), []
-            say(f'{dataset.rollouts:,} rollouts, {dataset.environment_steps:,} environment steps, {baseline.episodes:,} episodes, '
-                f'{baseline.held_out_episodes:,} of them held out{skipped and f"; skipped: {skipped}"}')
+            say(f'{dataset.rollouts:,} rollouts, {dataset.environment_steps:,} environment steps, {baseline.episodes:,} episodes '
+                f'with {baseline.held_out_episodes:,} held out{skipped and f"; skipped: {skipped}"}')
             for epoch in training.run():
                 epochs.append(epoch)
                 progress.update(bar, description=f'epoch {epoch.number + 1}')
