@@ -74,6 +74,13 @@ class RewardNetworkSettings:
                                    unit='rollouts', minimum=0, maximum=100_000)
     replay_steps: int = setting(40, 'gradient steps per update on replayed rollouts', unit='steps', minimum=1, maximum=100_000)
     replay_chunks: int = setting(64, 'chunks drawn for each of these steps', unit='chunks', minimum=1, maximum=1_000_000)
+    path: str = setting('', 'file of train_reward with the reward networks to begin with; empty for untrained ones. A run '
+                            'that is resumed no longer reads it')
+    freeze: bool = setting(False, 'keep the reward networks as they are in the file')
+
+    def __post_init__(self):
+        if self.freeze and not self.path:
+            raise SettingsError('reward_network.freeze keeps the networks of a file: name it in reward_network.path')
 
 
 @dataclass(frozen=True)

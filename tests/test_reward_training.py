@@ -9,10 +9,15 @@ from dae_ros_nodes import train_reward
 
 from dae_ros import config
 from dae_ros.config import RewardTrainingSettings
-from dae_ros.errors import BagError, Refused
+from dae_ros.errors import BagError, Refused, SettingsError
 from dae_ros.replay.dataset import Dataset
 from dae_ros.replay.reward_training import RewardTraining
+from dae_ros.report.metrics import read_metrics
+from dae_ros.rollout.in_process import train
+from dae_ros.run_folder import RunFolder
+from dae_ros.training import Training
 from dae_ros.weights.codec import decode_policy, decode_reward_network
+from dae_ros.worlds import make_worlds
 from tests.bags import Team, write_bag
 
 GAME = {'task': 'matrix_game', 'num_agents': 3, 'num_steps': 9, 'num_worlds': 32}
@@ -53,7 +58,7 @@ def test_every_form_of_the_network_learns(values, bag):
     tensors, schema = decode_reward_network(file)
     settings = config.from_flat({**QUICK, **values}).reward_network
     assert schema['architecture'] == settings.architecture and schema['members'] == settings.ensemble_size
-    assert schema['spec'] == Team(**GAME).spec._asdict()
+    assert (schema['num_agents'], schema['num_actions'], schema['state_size']) == (3, 3, 3)
     assert {name.split('.')[0] for name in tensors} == {str(member) for member in range(settings.ensemble_size)}
 
 
@@ -100,6 +105,79 @@ def test_a_reward_network_is_no_policy_and_a_damaged_one_is_refused(bag):
         spoilt = bytearray(file[:draw.randrange(1, len(file))])
         with pytest.raises(Refused):
             decode_reward_network(bytes(spoilt))
+
+
+# A training that begins with such a file.
+
+LIVE = {**GAME, **QUICK, 'num_worlds': 8, 'hidden_size': 16, 'epochs': 2, 'total_steps': 3 * 72, 'evaluation_episodes': 0}
+
+
+def run_live(folder, **values):
+    """Every update's metrics, and all of the reward network at the end."""
+    settings = config.from_flat({**LIVE, **values})
+    worlds = make_worlds(settings.task)
+    training = Training(settings, worlds.spec, RunFolder(folder, settings))
+    train(training, worlds, lambda: None)
+    training.close()
+    state = {name: tensor.copy() for name, tensor in training._learner.state().items() if 'reward_network' in name}
+    return read_metrics(folder / 'metrics.csv'), state
+
+
+@pytest.fixture(scope='module')
+def file(bag, tmp_path_factory):
+    path = tmp_path_factory.mktemp('networks') / 'reward.safetensors'
+    path.write_bytes(trained(bag, max_epochs=8)[2])
+    return path
+
+
+def test_a_training_may_begin_with_the_networks_of_a_file_or_keep_them(file, tmp_path):
+    before = {f'reward_network.{name.replace(".", ".parameters.", 1)}': tensor
+              for name, tensor in decode_reward_network(file.read_bytes())[0].items()}
+    cold, _ = run_live(tmp_path / 'cold')
+    warm, learnt = run_live(tmp_path / 'warm', **{'reward_network.path': str(file)})
+    frozen, kept = run_live(tmp_path / 'frozen', **{'reward_network.path': str(file), 'reward_network.freeze': True})
+    explained = 'reward_network/explained_variance'
+    assert warm[explained][0] == frozen[explained][0] > 0.7 > cold[explained][0]
+    assert all(np.array_equal(kept[name], tensor) for name, tensor in before.items())
+    assert not all(np.array_equal(learnt[name], tensor) for name, tensor in before.items())
+    assert 'reward_network/loss' in warm and 'reward_network/loss' not in frozen
+
+
+def test_a_resumed_run_needs_its_file_no_more(file, tmp_path):
+    own = tmp_path / 'reward.safetensors'
+    own.write_bytes(file.read_bytes())
+    values = {'reward_network.path': str(own), 'checkpoint_interval': 1}
+    _, expected = run_live(tmp_path / 'run', **values)
+    for checkpoint in sorted((tmp_path / 'run/checkpoints').iterdir())[1:]:
+        checkpoint.unlink()
+    own.unlink()
+    _, resumed = run_live(tmp_path / 'run', **values)
+    assert all(np.array_equal(expected[name], tensor) for name, tensor in resumed.items())
+
+
+@pytest.mark.parametrize('values, complaint', [
+    ({'num_agents': 4}, 'num_agents is 3 there and 4 here, num_actions is 3 there and 4 here, state_size is 3'),
+    ({'reward_network.hidden_size': 64}, 'do not fit this run: hidden_size is 32 there and 64 here; train some from bags'),
+    ({'reward_network.ensemble_size': 2}, 'members is 1 there and 2 here'),
+    ({'reward_network.recurrent': False}, 'recurrent is True there and False here'),
+    ({'reward_network.architecture': 'shared_trunk'}, "architecture is 'per_agent' there and 'shared_trunk' here"),
+    ({'beta': 0.0}, 'reward_network.path needs the reward network that estimator = dae has at beta above 0'),
+    ({'estimator': 'coma'}, 'reward_network.path needs the reward network'),
+])
+def test_networks_that_do_not_fit_are_refused_in_one_sentence(values, complaint, file, tmp_path):
+    with pytest.raises(SettingsError) as caught:
+        run_live(tmp_path / 'run', **{'reward_network.path': str(file), **values})
+    assert complaint in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_a_file_that_is_missing_or_something_else_is_refused(bag, tmp_path):
+    with pytest.raises(SettingsError, match='cannot read reward_network.path .*: No such file'):
+        run_live(tmp_path / 'run', **{'reward_network.path': str(tmp_path / 'missing')})
+    (tmp_path / 'other').write_bytes(b'something else')
+    with pytest.raises(SettingsError, match='is not a file of train_reward'):
+        run_live(tmp_path / 'run2', **{'reward_network.path': str(tmp_path / 'other')})
+    with pytest.raises(SettingsError, match='name it in reward_network.path'):
+        run_live(tmp_path / 'run3', **{'reward_network.freeze': True})
 
 
 # The command.

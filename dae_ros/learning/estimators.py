@@ -77,7 +77,8 @@ class DifferenceEstimator:
         self._reward = [ActionNetwork(f'reward_network.{member}', make_reward_network(spec, reward_settings, seed, member),
                                       reward_settings.learning_rate, settings, passes)
                         for member in range(reward_settings.ensemble_size if settings.beta > 0 else 0)]
-        self._replay = RewardReplay(reward_settings, seed) if self._reward and reward_settings.replay_rollouts else None
+        replays = self._reward and reward_settings.replay_rollouts and not reward_settings.freeze
+        self._replay = RewardReplay(reward_settings, seed) if replays else None
 
     def estimate(self, data: Trajectory, rollout: int) -> Estimate:
         """Advantages (algorithm 1, line 19), and the trainings of critic and reward networks on the rollout."""
@@ -102,7 +103,8 @@ class DifferenceEstimator:
             error = (taken - data.rewards.unsqueeze(-1)).square().mean()
             metrics['reward_network/explained_variance'] = float(
                 1 - error / data.rewards.var(correction=0).clamp_min(1e-12))
-            trainings = self._reward_trainings(remembered, inputs, states, rollout)
+            if not self._reward_settings.freeze:
+                trainings = self._reward_trainings(remembered, inputs, states, rollout)
 
         # Line 20: value targets; the critic sees one state per world, so it regresses on the agents' mean.
         targets = values[:-1] + (estimated.mean(-1) if settings.value_target == 'difference' else team)
@@ -119,6 +121,11 @@ class DifferenceEstimator:
             raise ValueError('at beta = 0 there is no reward network')
         predicted, _, _ = self._predicted_rewards(as_remembered(data, self._reward_settings))
         return advantages.expected_rewards(predicted, data.probabilities)
+
+    def begin_with(self, reward_networks: list[dict[str, Tensor]]) -> None:
+        """Takes over the parameters of reward networks that were trained before, one for each member."""
+        for member, parameters in zip(self._reward, reward_networks):
+            member.adam.load_state(member.adam.state() | parameters)
 
     def networks(self) -> dict[str, FlatAdam]:
         return {'critic': self._critic} | {member.name: member.adam for member in self._reward}

@@ -17,7 +17,7 @@ from torch import Tensor
 from dae_ros import draws
 from dae_ros.config import RewardTrainingSettings, Settings
 from dae_ros.errors import BagError
-from dae_ros.learning import advantages
+from dae_ros.learning import advantages, reward_files
 from dae_ros.learning.chunks import ActionChunks, first_states, to_chunks
 from dae_ros.learning.device import chosen_device
 from dae_ros.learning.estimators import ActionNetwork, action_chunks, as_remembered, chunk_length
@@ -26,7 +26,6 @@ from dae_ros.learning.passes import Passes
 from dae_ros.replay.dataset import Dataset
 from dae_ros.replay.joiner import Rollout
 from dae_ros.types import Trajectory
-from dae_ros.weights.codec import encode_reward_network
 
 SHOWN = 4000  # held-out predictions kept for the report
 
@@ -96,10 +95,8 @@ class RewardTraining:
 
     def file(self) -> bytes:
         """The networks as a safetensors file, with what they are in its schema."""
-        tensors = {f'{member}.{name}': parameter.detach().cpu().numpy() for member, network in enumerate(self._members)
-                   for name, parameter in network.adam.network.named_parameters()}
-        network = {name: getattr(self._reward, name) for name in ('architecture', 'hidden_size', 'trunk_size', 'recurrent')}
-        return encode_reward_network(tensors, {'spec': self._dataset.spec._asdict(), 'members': len(self._members), **network})
+        networks = [member.adam.network for member in self._members]
+        return reward_files.encode(networks, self._dataset.spec, self._reward)
 
     def held_out(self) -> HeldOut:
         """Predictions on the first held-out episodes."""
