@@ -1,5 +1,6 @@
 """A recording holds every message, whatever the form, and after a crash all but the last half second."""
 
+import resource
 import signal
 import struct
 import subprocess
@@ -86,6 +87,23 @@ def test_nothing_that_exists_is_written_over(heard, tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(BagError, match='cannot write the bag'):
         Recording(tmp_path / 'file' / 'bag', heard[0])
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_a_disk_that_is_full_ends_the_recording_with_one_sentence(storage, heard, tmp_path):
+    """A limit on the size of files stands for the disk's end."""
+    topics, messages = heard
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    recording = Recording(tmp_path / 'bag', topics, storage)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(BagError, match='cannot write the bag .*bag: ') as caught:
+            for moment in range(10_000):
+                recording.write(messages[1][0], 10**18 + moment * 10**9, messages[1][1])
+        recording.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert '\n' not in str(caught.value)
 
 
 WRITING = '''

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 import struct
 from binascii import crc32
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
+from typing import Iterator, NamedTuple
 
 from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
@@ -45,6 +47,7 @@ class Recording:
         self._split_bytes = split_bytes
         self._split_time = split_time
         self._bags = 0
+        self._refused = False
         self._begin()
 
     @property
@@ -53,13 +56,14 @@ class Recording:
         return self._writer.path
 
     def write(self, topic: str, time: int, data: bytes) -> None:
-        """Adds a serialized message that came at `time` [ns]."""
+        """Adds a serialized message that came at `time` [ns]. BagError if the disk does not take it."""
         self._began = self._began or time
         if 0 < self._split_bytes <= self._bytes or 0 < self._split_time <= time - self._began:
-            self._writer.close()
+            self.close()
             self._begin()
             self._began = time
-        self._writer.write(self._connections[topic], time, data)
+        with self._explained():
+            self._writer.write(self._connections[topic], time, data)
         self._bytes += len(data)
         self.messages[topic] += 1
         self.flush_if_due(time)
@@ -68,11 +72,23 @@ class Recording:
         """Hands what was written to the system if the last time was long enough ago; nothing of it is lost from then on."""
         if time - self._flushed >= FLUSH_PERIOD:
             self._flushed = time
-            self._writer.storage.flush()
+            with self._explained():
+                self._writer.storage.flush()
 
     def close(self) -> None:
-        """Completes the bag."""
-        self._writer.close()
+        """Completes the bag, unless the disk has refused it."""
+        if not self._refused:
+            with self._explained():
+                self._writer.close()
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Turns what a full disk makes somebody raise into a BagError."""
+        try:
+            yield
+        except (OSError, sqlite3.Error) as error:
+            self._refused = True
+            raise BagError(f'cannot write the bag {self.path}: {getattr(error, "strerror", None) or error}') from error
 
     def _begin(self) -> None:
         split = self._split_bytes or self._split_time
