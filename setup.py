@@ -3,7 +3,7 @@ from glob import glob
 
 from setuptools import find_packages, setup
 
-EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'trainer', 'world')
+EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'recorder', 'train_reward', 'trainer', 'world')
 
 setup(
     name='dae_ros',
@@ -15,10 +15,11 @@ setup(
         ('share/ament_index/resource_index/packages', ['resource/dae_ros']),
         ('share/dae_ros', ['package.xml']),
         ('share/dae_ros/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        ('share/dae_ros/config/bags', sorted(glob('config/bags/*.yaml'))),
         ('share/dae_ros/launch', sorted(glob('launch/*.py'))),
     ],
     python_requires='>=3.10',
-    install_requires=['matplotlib', 'numpy', 'pillow', 'pyyaml', 'rich', 'safetensors', 'tensorboard', 'torch'],
+    install_requires=['matplotlib', 'numpy', 'pillow', 'pyyaml', 'rich', 'rosbags', 'safetensors', 'tensorboard', 'torch'],
     zip_safe=False,
     author='dae_ros maintainers',
     author_email='dae_ros@example.org',

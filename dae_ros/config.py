@@ -73,6 +73,13 @@ class RewardNetworkSettings:
                                    unit='rollouts', minimum=0, maximum=100_000)
     replay_steps: int = setting(40, 'gradient steps per update on replayed rollouts', unit='steps', minimum=1, maximum=100_000)
     replay_chunks: int = setting(64, 'chunks drawn for each of these steps', unit='chunks', minimum=1, maximum=1_000_000)
+    path: str = setting('', 'file of train_reward with the reward networks to begin with; empty for untrained ones. A run '
+                            'that is resumed no longer reads it')
+    freeze: bool = setting(False, 'keep the reward networks as they are in the file')
+
+    def __post_init__(self):
+        if self.freeze and not self.path:
+            raise SettingsError('reward_network.freeze keeps the networks of a file: name it in reward_network.path')
 
 
 @dataclass(frozen=True)
@@ -175,11 +182,39 @@ class ParameterServerSettings:
 
 
 @dataclass(frozen=True)
+class RecorderSettings:
+    """What is particular to the recorder."""
+
+    bag: str = setting('', 'folder of the bag, which must not exist yet; empty takes bags/<time>. Where it is split, _0, _1, ... '
+                           'follow the name')
+    storage: str = setting('mcap', 'format of the bag', choices=('mcap', 'sqlite3'))
+    compression: str = setting('none', 'compression of the bag', choices=('none', 'zstd'))
+    split_megabytes: int = setting(0, 'a new bag is begun after so much data, before compression; 0 for never', unit='MB',
+                                   minimum=0, maximum=1_000_000_000)
+    split_seconds: int = setting(0, 'a new bag is begun after this long; 0 for never', unit='s', minimum=0, maximum=1_000_000_000)
+    everything: bool = setting(False, 'also record observations and policies, which neither a replay to a trainer nor reward '
+                                      'training needs')
+
+
+@dataclass(frozen=True)
 class TrainerSettings:
     """What is particular to the trainer."""
 
     run_folder: str = setting('', 'folder for settings, metrics, checkpoints and policy; empty takes '
                                   'runs/<task>_n<robots>_seed<seed>. A folder with a checkpoint of the same run resumes it')
+
+
+@dataclass(frozen=True)
+class RewardTrainingSettings:
+    """How a reward network is trained from bags. Only train_reward needs it, beside those of the reward network."""
+
+    held_out: float = setting(0.1, 'share of the episodes that are not learnt from but measured on', minimum=0.001, maximum=0.999)
+    max_epochs: int = setting(100, 'most passes over the bags', unit='epochs', minimum=1, maximum=1_000_000)
+    patience: int = setting(5, 'passes without a smaller held-out error after which it ends', unit='epochs', minimum=1,
+                            maximum=1_000_000)
+    batch_chunks: int = setting(64, 'chunks of a gradient step', unit='chunks', minimum=1, maximum=1_000_000)
+    pool_chunks: int = setting(4096, 'chunks held in memory and mixed with each other', unit='chunks', minimum=1,
+                               maximum=100_000_000)
 
 
 NESTED_GROUPS = ('reward_network',)

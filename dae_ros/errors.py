@@ -31,6 +31,10 @@ class StalledError(DaeRosError):
     """A run cannot go on: nobody answers, however often they are asked."""
 
 
+class BagError(DaeRosError):
+    """A bag cannot be read or written: it is not there, not a bag, or of messages that are not ours."""
+
+
 class Refused(DaeRosError):
     """A message from outside that is not acted on.
 

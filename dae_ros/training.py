@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.files import write_atomically
+from dae_ros.learning import reward_files
 from dae_ros.learning.distributed import make_learner
 from dae_ros.learning.estimators import ExpectedRewards
 from dae_ros.learning.policy import Policy
@@ -62,6 +64,8 @@ class Training:
         resumed = folder.newest_checkpoint()
         if resumed is not None:
             self._resume(*resumed)
+        elif settings.reward_network.path:
+            self._learner.begin_with(reward_files.read(Path(settings.reward_network.path), spec, settings.reward_network))
         self._log = MetricsLog(folder.path, None if resumed is None else self.environment_steps)
         self._began_at: float | None = None
         self._steps_at_start = self.environment_steps

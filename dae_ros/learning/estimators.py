@@ -85,7 +85,8 @@ class DifferenceEstimator:
         self._reward = [ActionNetwork(f'reward_network.{member}', make_reward_network(spec, reward_settings, seed, member),
                                       reward_settings.learning_rate, settings, passes)
                         for member in range(reward_settings.ensemble_size if settings.beta > 0 and not exact_rewards else 0)]
-        self._replay = RewardReplay(reward_settings, seed) if self._reward and reward_settings.replay_rollouts else None
+        replays = self._reward and reward_settings.replay_rollouts and not reward_settings.freeze
+        self._replay = RewardReplay(reward_settings, seed) if replays else None
 
     def estimate(self, data: Trajectory, rollout: int) -> Estimate:
         """Advantages (algorithm 1, line 19), and the trainings of critic and reward networks on the rollout."""
@@ -103,14 +104,15 @@ class DifferenceEstimator:
         if self._exact_rewards is not None:
             expected = torch.from_numpy(self._exact_rewards(Trajectory(*(part.cpu().numpy() for part in data)))).to(team)
         elif self._reward:
-            remembered = self._remembered(data)
+            remembered = as_remembered(data, self._reward_settings)
             predicted, inputs, states = self._predicted_rewards(remembered)
             expected = advantages.expected_rewards(predicted, data.probabilities)
             taken = advantages.of_actions(predicted, data.actions)
             error = (taken - data.rewards.unsqueeze(-1)).square().mean()
             metrics['reward_network/explained_variance'] = float(
                 1 - error / data.rewards.var(correction=0).clamp_min(1e-12))
-            trainings = self._reward_trainings(remembered, inputs, states, rollout)
+            if not self._reward_settings.freeze:
+                trainings = self._reward_trainings(remembered, inputs, states, rollout)
         estimated = team.unsqueeze(-1).expand(data.actions.shape)
         if expected is not None:
             estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
@@ -129,7 +131,13 @@ class DifferenceEstimator:
         """E over a_i ~ pi_i of the predicted reward, [T, W, N]. Raises ValueError at beta = 0, which has no reward network."""
         if not self._reward:
             raise ValueError('at beta = 0 there is no reward network')
-        return advantages.expected_rewards(self._predicted_rewards(self._remembered(data))[0], data.probabilities)
+        predicted, _, _ = self._predicted_rewards(as_remembered(data, self._reward_settings))
+        return advantages.expected_rewards(predicted, data.probabilities)
+
+    def begin_with(self, reward_networks: list[dict[str, Tensor]]) -> None:
+        """Takes over the parameters of reward networks that were trained before, one for each member."""
+        for member, parameters in zip(self._reward, reward_networks):
+            member.adam.load_state(member.adam.state() | parameters)
 
     def networks(self) -> dict[str, FlatAdam]:
         return {'critic': self._critic} | {member.name: member.adam for member in self._reward}
@@ -151,12 +159,6 @@ class DifferenceEstimator:
             ongoing = torch.zeros(1, len(data.final_states), dtype=torch.bool, device=outputs.device)
             final_values = critic(data.final_states[None, :, None], hidden[:-1][data.truncated], ongoing)[0].view(-1)
         return outputs.flatten(1), hidden, final_values
-
-    def _remembered(self, data: Trajectory) -> Trajectory:
-        """The rollout as far as the reward networks remember it: without memory, every step begins an episode."""
-        if self._reward_settings.recurrent:
-            return data
-        return data._replace(episode_start=torch.ones_like(data.episode_start))
 
     def _predicted_rewards(self, data: Trajectory) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The ensemble's mean prediction [T, W, N, A], what it is made from, and each member's recurrent states."""
@@ -245,6 +247,11 @@ class CounterfactualEstimator:
 
 
 ESTIMATORS = {'dae': DifferenceEstimator, 'coma': CounterfactualEstimator, 'coma_nstep': CounterfactualEstimator}
+
+
+def as_remembered(data: Trajectory, settings: RewardNetworkSettings) -> Trajectory:
+    """The rollout as far as reward networks remember it: without memory, every step begins an episode."""
+    return data if settings.recurrent else data._replace(episode_start=torch.ones_like(data.episode_start))
 
 
 def chunk_length(data: Trajectory, settings: LearnerSettings) -> int:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
+from dae_ros.errors import SettingsError
 from dae_ros.learning import advantages, losses
 from dae_ros.learning.chunks import PolicyChunks, first_states, to_chunks
 from dae_ros.learning.estimators import ESTIMATORS, DifferenceEstimator, ExpectedRewards, chunk_length
@@ -75,6 +76,16 @@ class Learner:
         if not isinstance(self._estimator, DifferenceEstimator):
             raise ValueError(f'with estimator = {self._settings.estimator} there is no reward network')
         return self._estimator.expected_rewards(self._tensors(trajectory)).cpu().numpy()
+
+    def begin_with(self, reward_networks: list[dict[str, np.ndarray]]) -> None:
+        """Begins with reward networks that were trained before, as `reward_files.read` gives them.
+
+        Raises SettingsError if there is none to be replaced.
+        """
+        if not isinstance(self._estimator, DifferenceEstimator) or not self._settings.beta:
+            raise SettingsError('reward_network.path needs the reward network that estimator = dae has at beta above 0')
+        self._estimator.begin_with([{f'parameters.{name}': torch.from_numpy(tensor) for name, tensor in parameters.items()}
+                                    for parameters in reward_networks])
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything the next update depends on, by name; views that change with the next update."""

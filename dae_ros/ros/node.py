@@ -54,8 +54,9 @@ class TeamNode(Node):
         callbacks = PublisherEventCallbacks(matched=self._guarded(lambda _: self.on_matched()))
         return self.create_publisher(kind, topic, profile, event_callbacks=callbacks)
 
-    def listen(self, kind: type, topic: str, profile: QoSProfile, handle: Callable[[Any], None]) -> Subscription:
-        """A subscription; a message that `handle` refuses is counted and otherwise ignored."""
+    def listen(self, kind: type, topic: str, profile: QoSProfile, handle: Callable[[Any], None],
+               raw: bool = False) -> Subscription:
+        """A subscription; a message that `handle` refuses is counted and otherwise ignored. `raw`: as bytes, not decoded."""
         def receive(message) -> None:
             try:
                 handle(message)
@@ -68,7 +69,7 @@ class TeamNode(Node):
             self.on_matched()
 
         callbacks = SubscriptionEventCallbacks(matched=self._guarded(match))
-        return self.create_subscription(kind, topic, self._guarded(receive), profile, event_callbacks=callbacks)
+        return self.create_subscription(kind, topic, self._guarded(receive), profile, event_callbacks=callbacks, raw=raw)
 
     def every(self, period: float, act: Callable[[], None]) -> Timer:
         """A timer that calls `act` each `period` seconds."""

@@ -23,3 +23,9 @@ ROLLOUT = _reliable(1024, DurabilityPolicy.VOLATILE)
 
 EVENTS = _reliable(10, DurabilityPolicy.VOLATILE)
 """A few messages now and then: diagnostics."""
+
+RECORDED = _reliable(8192, DurabilityPolicy.VOLATILE)
+"""For the recorder, whom nobody waits for: data queue up while the disk is slow."""
+
+RECORDED_LATCHED = _reliable(8192, DurabilityPolicy.TRANSIENT_LOCAL)
+"""The same for what is latched: every value, and the last one before it came."""

@@ -1,4 +1,4 @@
-"""Policies and checkpoints as safetensors files: a schema in the metadata, a checksum, never pickle.
+"""Policies, reward networks and checkpoints as safetensors files: a schema in the metadata, a checksum, never pickle.
 
 What comes in is trusted for nothing: size, schema, shapes and finiteness are checked before a tensor is used.
 """
@@ -20,6 +20,7 @@ from dae_ros.types import PolicyWeights
 
 POLICY_FORMAT = 'dae_ros.policy/1'
 CHECKPOINT_FORMAT = 'dae_ros.checkpoint/1'
+REWARD_NETWORK_FORMAT = 'dae_ros.reward_network/1'
 MAX_POLICY_BYTES = 64 * 2**20
 _HEADER_LENGTH = struct.Struct('<Q')
 
@@ -69,6 +70,20 @@ def decode_policy(data: bytes) -> Policy:
         if tensor.dtype != np.float32 or not np.isfinite(tensor).all():
             raise Refused(Refused.NOT_FINITE, f'{name} is not all finite 32-bit numbers')
     return policy
+
+
+def encode_reward_network(tensors: Mapping[str, np.ndarray], schema: Mapping[str, Any]) -> bytes:
+    """A file of reward networks: tensors by name, `<member>.<parameter>`, and what they are (JSON values)."""
+    return _encode(REWARD_NETWORK_FORMAT, tensors, schema)
+
+
+def decode_reward_network(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors and schema of a file of reward networks. Raises Refused if it is anything else."""
+    tensors, schema = _decode(REWARD_NETWORK_FORMAT, data)
+    for name, tensor in tensors.items():
+        if tensor.dtype != np.float32 or not np.isfinite(tensor).all():
+            raise Refused(Refused.NOT_FINITE, f'{name} is not all finite 32-bit numbers')
+    return tensors, schema
 
 
 def encode_checkpoint(tensors: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> bytes:

@@ -1,0 +1,51 @@
+"""Reward networks as files: what `train_reward` writes and a training may begin with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Iterable
+
+import numpy as np
+
+from dae_ros.config import RewardNetworkSettings
+from dae_ros.errors import Refused, SettingsError
+from dae_ros.learning.networks import RewardNetwork, make_reward_network
+from dae_ros.types import WorldSpec
+from dae_ros.weights.codec import decode_reward_network, encode_reward_network
+
+
+def encode(networks: Iterable[RewardNetwork], spec: WorldSpec, settings: RewardNetworkSettings) -> bytes:
+    """The file; equal networks give equal bytes."""
+    tensors = {f'{member}.{name}': parameter.detach().cpu().numpy() for member, network in enumerate(networks)
+               for name, parameter in network.named_parameters()}
+    return encode_reward_network(tensors, _schema(spec, settings))
+
+
+def read(path: Path, spec: WorldSpec, settings: RewardNetworkSettings) -> list[dict[str, np.ndarray]]:
+    """Each network's parameters by name. SettingsError if the file cannot be read or its networks are of another kind."""
+    try:
+        tensors, found = decode_reward_network(path.read_bytes())
+    except OSError as error:
+        raise SettingsError(f'cannot read reward_network.path {path}: {error.strerror}') from error
+    except Refused as refusal:
+        raise SettingsError(f'reward_network.path {path} is not a file of train_reward: {refusal.detail}') from refusal
+    asked = _schema(spec, settings)
+    different = [f'{name} is {found.get(name)!r} there and {value!r} here' for name, value in asked.items()
+                 if found.get(name) != value]
+    if different:
+        raise SettingsError(f'the reward networks in {path} do not fit this run: {", ".join(different)}; train some from bags of '
+                            'this task, or change the settings')
+    expected = {name: tuple(parameter.shape)
+                for name, parameter in make_reward_network(spec, settings, 0, 0).named_parameters()}
+    members = [{name: tensors.get(f'{member}.{name}', np.empty(0)) for name in expected} for member in range(asked['members'])]
+    if any(tensor.shape != expected[name] for member in members for name, tensor in member.items()):
+        raise SettingsError(f'reward_network.path {path} lacks tensors of the networks it says it holds: train it anew')
+    return members
+
+
+def _schema(spec: WorldSpec, settings: RewardNetworkSettings) -> dict[str, Any]:
+    """All that the parameters depend on, as JSON values."""
+    trunk = {'trunk_size': settings.trunk_size} if settings.architecture == 'shared_trunk' else {}
+    return {'num_agents': spec.num_agents, 'num_actions': spec.num_actions, 'state_size': spec.state_size,
+            'members': settings.ensemble_size, 'architecture': settings.architecture, 'hidden_size': settings.hidden_size,
+            'recurrent': settings.recurrent, **trunk}

@@ -1,0 +1,120 @@
+"""What the recorder holds of a real run is that run, message for message."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import time
+
+import numpy as np
+import pytest
+import yaml
+from dae_ros_msgs.msg import TrainingStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from harness import REPOSITORY, SMALL, Listener
+from rosbags.rosbag2 import Reader
+from std_srvs.srv import Trigger
+
+from dae_ros import config
+from dae_ros.replay.dataset import Dataset
+from dae_ros.rollout.in_process import train
+from dae_ros.ros import names, qos
+from dae_ros.ros.graph import NodeProcess
+from dae_ros.ros.recorded import team_topics
+from dae_ros.run_folder import RunFolder
+from dae_ros.training import Training
+from dae_ros.worlds import make_worlds
+
+
+def trajectories(folder, values):
+    """Every rollout of the same run in this process, the evaluation's too."""
+    settings = config.from_flat(values)
+    worlds = make_worlds(settings.task)
+    training, seen = Training(settings, worlds.spec, RunFolder(folder, settings)), []
+    consume = training.consume
+    training.consume = lambda trajectory: (seen.append(trajectory), consume(trajectory))
+    train(training, worlds, lambda: None)
+    training.close()
+    return seen
+
+
+class Recorder:
+    """What the recorder says of itself on /diagnostics."""
+
+    def __init__(self, listener):
+        self.sentence, self.values = '', {}
+        listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._hear, qos.EVENTS)
+
+    def _hear(self, report):
+        for status in report.status:
+            if status.name == '/recorder':
+                self.sentence, self.values = status.message, {value.key: value.value for value in status.values}
+
+
+@pytest.mark.parametrize('parameters, end', [
+    ({}, signal.SIGINT), ({'storage': 'sqlite3'}, signal.SIGTERM), ({'compression': 'zstd', 'split_megabytes': 1}, signal.SIGINT),
+    ({}, signal.SIGKILL)], ids=['mcap', 'sqlite3', 'split and compressed', 'killed'])
+def test_a_recorded_run_holds_every_message_and_its_trajectories_bit_for_bit(parameters, end, make_graph, tmp_path):
+    graph = make_graph(tmp_path / 'graph', SMALL)
+    graph.processes['recorder'] = NodeProcess('recorder', 'recorder', {'bag': str(tmp_path / 'bag'), **parameters})
+    with Listener() as listener:
+        recorder = Recorder(listener)
+        graph.start('trainer')
+        assert listener.call(Trigger, 'trainer/pause', Trigger.Request()).success
+        graph.start(*(name for name in graph.names if name != 'trainer'))
+        listener.wait_for_status(lambda status: status.state == TrainingStatus.PAUSED)
+        listener.spin_until(lambda: recorder.sentence == 'recording', lambda: graph.log('recorder'))
+        assert listener.call(Trigger, 'trainer/resume', Trigger.Request()).success
+        assert graph.wait() == 0, graph.log('trainer')
+        expected = trajectories(tmp_path / 'alone', SMALL)
+        at_least = len(expected) * (1 + 26 + 25 + 3 * 25)
+        listener.spin_until(lambda: int(recorder.values['messages']) > at_least, lambda: str(recorder.values))
+    time.sleep(1.0)  # what a kill may cost
+    os.kill(graph._supervisor._processes['recorder'].pid, end)
+    code = graph.wait('recorder')
+    assert code == (-end if end == signal.SIGKILL else 0)
+    if code == 0:
+        assert re.search(r'\d+ messages in .*bag', graph.log('recorder')) and 'missed' not in graph.log('recorder')
+
+    dataset = Dataset(f'{tmp_path / "bag"}*')
+    read = list(dataset.read())
+    assert [rollout.request.rollout for rollout in read] == list(range(len(expected)))
+    assert all(np.array_equal(a, b) for live, rollout in zip(expected, read) for a, b in zip(live, rollout.trajectory))
+    assert set(dataset.skipped) <= ({'truncated'} if code else set())
+
+
+def test_what_the_recorder_writes_is_read_without_our_messages(make_graph, tmp_path):
+    graph = make_graph(tmp_path / 'graph', SMALL)
+    graph.processes['recorder'] = NodeProcess('recorder', 'recorder', {'bag': str(tmp_path / 'bag'), 'everything': True})
+    graph.start('recorder')
+    with Listener() as listener:
+        recorder = Recorder(listener)
+        listener.spin_until(lambda: recorder.sentence.startswith('waiting for rollout_request'), lambda: graph.log('recorder'))
+        graph.start(*(name for name in graph.names if name != 'recorder'))
+        assert graph.wait() == 0, graph.log('trainer')
+    graph.stop()
+    with Reader(tmp_path / 'bag') as reader:
+        topics = {connection.topic: connection for connection in reader.connections}
+        assert set(topics) == {'/rollout_request', '/training_status', '/joint_state', '/shared_reward', '/policy',
+                               *(f'/robot_{robot}/{name}' for robot in range(3) for name in ('action', 'observation'))}
+        assert '# Where in a run a datum belongs' in topics['/joint_state'].msgdef.data
+        assert all(connection.digest.startswith('RIHS01_') for connection in topics.values())
+        assert topics['/policy'].ext.offered_qos_profiles[0].durability.name == 'TRANSIENT_LOCAL'
+
+
+def test_a_recorder_writes_over_nothing(make_graph, tmp_path):
+    graph = make_graph(tmp_path / 'graph', SMALL)
+    graph.processes['recorder'] = NodeProcess('recorder', 'recorder', {'bag': str(tmp_path)})
+    graph.start('recorder')
+    assert graph.wait('recorder') == 2
+    assert graph.log('recorder').startswith(f'error: {tmp_path} exists already')
+
+
+def test_the_overrides_for_ros2_bag_record_are_those_the_recorder_listens_with():
+    overrides = yaml.safe_load((REPOSITORY / 'config/bags/record_qos.yaml').read_text())
+    topics = {f'/{topic.name}': topic.profile for topic in team_topics(8, 1, True)}
+    assert set(overrides) == set(topics)
+    for name, profile in topics.items():
+        assert overrides[name] == {'history': 'keep_last', 'depth': profile.depth, 'reliability': 'reliable',
+                                   'durability': profile.durability.name.lower()}
