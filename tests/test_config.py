@@ -51,14 +51,15 @@ def values_of(info: SettingInfo) -> SearchStrategy:
     return strategies.text()
 
 
-def with_equal_groups(values):
-    """The values with a number of worlds that can be split into the groups they say."""
+def consistent(values):
+    """The values with a number of worlds that can be split into the groups they say, and a file for networks to be kept."""
     groups, worlds = values.get('world_groups', 1), values.get('num_worlds', 128)
-    return values | {'num_worlds': max(groups, worlds - worlds % groups)} if groups > 1 else values
+    values = values | {'num_worlds': max(groups, worlds - worlds % groups)} if groups > 1 else values
+    return values | {'reward_network.path': 'some.safetensors'} if values.get('reward_network.freeze') else values
 
 
 SOME_VALUES = strategies.fixed_dictionaries({}, optional={
-    name: values_of(info) for name, info in SETTINGS.items()}).map(with_equal_groups)
+    name: values_of(info) for name, info in SETTINGS.items()}).map(consistent)
 
 
 def read_text(text: str | bytes) -> dict:
