@@ -191,7 +191,7 @@ def test_settings_come_back_from_yaml_as_they_were(values):
 @by_name([info for info in SETTINGS.values() if info.kind is not str])
 def test_the_digest_tells_every_change_of_a_setting(info):
     changed = not info.default if info.kind is bool else info.maximum if info.default != info.maximum else info.minimum
-    base = config.from_flat({'num_worlds': SETTINGS['world_groups'].maximum})
+    base = config.from_flat({'num_worlds': SETTINGS['world_groups'].maximum, 'reward_network.path': 'some.safetensors'})
     assert config.digest(config.from_flat({info.name: changed}, base)) != config.digest(base)
     assert config.digest(config.from_flat({info.name: config.flatten(base)[info.name]}, base)) == config.digest(base)
 
