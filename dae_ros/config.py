@@ -42,7 +42,6 @@ class TaskSettings:
     episode_steps: int = setting(0, 'steps after which an episode ends; 0 takes the task\'s own (25 in the particle tasks, '
                                     'N in the matrix game)', unit='steps', minimum=0, maximum=1_000_000)
     observe_others: bool = setting(False, 'formation and line: each robot also observes the other robots\' relative positions')
-    observe_id: bool = setting(False, 'matrix_game: each agent also observes its own number, one-hot')
     reward_delay: int = setting(0, 'steps after which a reward is paid; what is still owed at an episode\'s end is paid with its '
                                    'last step. Built-in tasks only', unit='steps', minimum=0, maximum=1_000_000)
 
@@ -76,11 +75,7 @@ class RewardNetworkSettings:
     replay_chunks: int = setting(64, 'chunks drawn for each of these steps', unit='chunks', minimum=1, maximum=1_000_000)
     path: str = setting('', 'file of train_reward with the reward networks to begin with; empty for untrained ones. A run '
                             'that is resumed no longer reads it')
-    freeze: bool = setting(False, 'keep the reward networks as they are in the file')
-
-    def __post_init__(self):
-        if self.freeze and not self.path:
-            raise SettingsError('reward_network.freeze keeps the networks of a file: name it in reward_network.path')
+    freeze: bool = setting(False, 'keep the reward networks as they are in the file that path names')
 
 
 @dataclass(frozen=True)

@@ -43,12 +43,11 @@ def probe(worlds: SynchronousWorlds, policy: Policy, expected_rewards: Callable[
     Draws are keyed by (seed, rollout) and apart from those of a training with that seed; the rollout leaves no trace in
     worlds that are reset before they are used again, as those of a training are.
     """
-    recorder = _Recorder(worlds)
+    recorder = AlternativesRecorder(worlds)
     request = RolloutRequest(run=1, rollout=rollout, attempt=0, policy_version=0, seed=draws.key(seed, 'probe'),
                              num_steps=num_steps, greedy=False)
     trajectory = InProcessCollector(recorder).collect(request, policy)
-    expected = (trajectory.probabilities * np.array(recorder.alternative_rewards)).sum(axis=-1)
-    return Probe(trajectory, expected, expected_rewards(trajectory))
+    return Probe(trajectory, recorder.expected_rewards(trajectory), expected_rewards(trajectory))
 
 
 def accuracy(rewards: np.ndarray, expected: np.ndarray, predicted: np.ndarray) -> Accuracy:
@@ -63,20 +62,25 @@ def accuracy(rewards: np.ndarray, expected: np.ndarray, predicted: np.ndarray) -
     )
 
 
-class _Recorder(Worlds):
-    """Worlds that keep what every action would have been rewarded with."""
+class AlternativesRecorder(Worlds):
+    """Worlds that keep what every action would have been rewarded with, since they were reset."""
 
     def __init__(self, worlds: SynchronousWorlds):
         self.spec, self.num_worlds = worlds.spec, worlds.num_worlds
-        self.alternative_rewards: list[np.ndarray] = []  # [W, N, A] for each step
+        self._alternatives: list[np.ndarray] = []  # [W, N, A] for each step
         self._worlds = worlds
 
     def reset(self, seed: int, rollout: int) -> JointObservation:
+        self._alternatives.clear()
         return self._worlds.reset(seed, rollout)
 
     def step(self, actions: np.ndarray) -> Transition:
-        self.alternative_rewards.append(self._worlds.alternative_rewards(actions))
+        self._alternatives.append(self._worlds.alternative_rewards(actions))
         return self._worlds.step(actions)
+
+    def expected_rewards(self, trajectory: Trajectory) -> np.ndarray:
+        """The true E over a_i ~ pi_i of the reward, [T, W, N] float64, of the rollout that was just simulated here."""
+        return (trajectory.probabilities * np.array(self._alternatives)).sum(axis=-1)
 
 
 def _share_explained(target: np.ndarray, error: np.ndarray) -> float:

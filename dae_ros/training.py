@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from dae_ros.config import Settings
 from dae_ros.files import write_atomically
 from dae_ros.learning import reward_files
 from dae_ros.learning.distributed import make_learner
+from dae_ros.learning.estimators import ExpectedRewards
 from dae_ros.learning.policy import Policy
 from dae_ros.report.metrics import MetricsLog
 from dae_ros.run_folder import RunFolder
@@ -39,14 +39,15 @@ def episode_returns(trajectory: Trajectory) -> np.ndarray:
 class Training:
     """The state of a run between rollouts. Resumes from the folder's newest checkpoint if there is one."""
 
-    def __init__(self, settings: Settings, spec: WorldSpec, folder: RunFolder):
+    def __init__(self, settings: Settings, spec: WorldSpec, folder: RunFolder, exact_rewards: ExpectedRewards | None = None):
+        """`exact_rewards`: as for `Learner`."""
         self.settings = settings
         self.spec = spec
         self.run = folder.run
         self.mean_return = math.nan
         self.evaluation: np.ndarray = np.empty(0)
         self._folder = folder
-        self._learner = make_learner(spec, settings)
+        self._learner = make_learner(spec, settings, exact_rewards)
         self._steps_per_rollout = settings.task.num_worlds * settings.run.num_steps
         self._training_rollouts = -(-settings.run.total_steps // self._steps_per_rollout)
         self._rollout = 0
@@ -56,8 +57,8 @@ class Training:
         resumed = folder.newest_checkpoint()
         if resumed is not None:
             self._resume(*resumed)
-        elif settings.reward_network.path:
-            self._learner.begin_with(reward_files.read(Path(settings.reward_network.path), spec, settings.reward_network))
+        elif settings.reward_network.path or settings.reward_network.freeze:
+            self._learner.begin_with(reward_files.read(spec, settings.reward_network))
         self._log = MetricsLog(folder.path, None if resumed is None else self.environment_steps)
         self._began_at: float | None = None
         self._steps_at_start = self.environment_steps

@@ -104,6 +104,8 @@ def _seed(run: Run, width: int, records: Records) -> Seed:
     metrics[SECONDS] = ends * np.median(sum(columns[part] for part in SPENT))
     credit = records.credit(run)
     for metric, name in PROBED.items():
-        if credit:
+        if run.exact:
+            metrics[metric] = np.ones(len(steps))
+        elif credit:
             metrics[metric] = np.interp(steps, credit[STEPS], credit[name])
     return Seed(run, steps, metrics)

@@ -19,6 +19,7 @@ FOLDER = ROOT / 'config' / 'figures'
 # One thread each: side by side, runs use the cores better than a learner's threads do.
 EVERY_RUN = {'device': 'cpu', 'learner_threads': 1}
 SECONDS = 'seconds'
+EXACT = 'exact'  # true among a curve's settings: its runs are told the simulator's E[r]
 METRICS = {'mean_return': 'mean return of an episode', 'advantage/deviation': 'standard deviation of the advantages',
            'reward_network/explained_variance': 'variance of the reward explained',
            'expected_reward/explained': 'variance of E[r] explained', 'credit/explained': 'credit explained',
@@ -33,6 +34,7 @@ class Run:
 
     name: str
     settings: Settings
+    exact: bool = False  # with the simulator's own E[r] in place of reward networks
 
     @property
     def seed(self) -> int:
@@ -94,7 +96,8 @@ class Figure:
 
     def run(self, team: Team, curve: str, seed: int, steps: int | None = None) -> Run:
         """The run behind one curve and seed; `steps` other than the team's make it a longer one."""
-        changes = self.curves[curve]
+        changes = dict(self.curves[curve])
+        exact = changes.pop(EXACT, False)
         values = {**_task_file(team.task), **EVERY_RUN, **(SHORT if self.short else {}), **changes,
                   'num_agents': team.num_agents, 'seed': seed, 'total_steps': steps or team.steps}
         try:
@@ -103,7 +106,7 @@ class Figure:
             raise SettingsError(f'curve {curve} of figure {self.name}: {error}') from error
         # Named after its settings, not after a figure or a curve, so that figures share it.
         different = ''.join(f'_{name}-{_text(config.flatten(settings)[name])}' for name in sorted(changes))
-        return Run(f'{team.task}_n{team.num_agents}{different}_seed{seed}', settings)
+        return Run(f'{team.task}_n{team.num_agents}{different}{f"_{EXACT}" if exact else ""}_seed{seed}', settings, bool(exact))
 
     def runs(self, team: Team, curve: str) -> list[Run]:
         """One for each seed."""

@@ -1,4 +1,4 @@
-"""python -m reproduce.run FOLDER SETTINGS: one training in this process, in one thread, resumed where it was interrupted.
+"""python -m reproduce.run FOLDER SETTINGS [exact]: one training in this process, in one thread, resumed where it was interrupted.
 
 SETTINGS is a JSON object of settings by their names. The folder is a run's folder as bringup makes it, and holds beside it
 `finished_<steps>.json`, the facts of every end it came to, and credit/metrics.csv, how well its reward network tells credit.
@@ -23,7 +23,7 @@ import torch
 from benchmarks.machine import description
 from dae_ros import config
 from dae_ros.config import Settings
-from dae_ros.credit_probe import accuracy, probe
+from dae_ros.credit_probe import AlternativesRecorder, accuracy, probe
 from dae_ros.errors import DaeRosError, RunFolderError
 from dae_ros.files import write_atomically
 from dae_ros.report.metrics import MetricsLog
@@ -32,6 +32,7 @@ from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
 from dae_ros.worlds import make_worlds
 from dae_ros.worlds.synchronous import SynchronousWorlds
+from reproduce.figures import EXACT
 from reproduce.records import finished_file
 
 NICENESS = 10  # whoever works on this machine comes first
@@ -42,8 +43,8 @@ class Stopped(Exception):
     """The run was asked to stop before its end; its checkpoint is written."""
 
 
-def run(path: Path, settings: Settings, stopping: Callable[[], bool]) -> None:
-    """Trains and evaluates in the folder `path` and writes its facts.
+def run(path: Path, settings: Settings, stopping: Callable[[], bool], exact: bool = False) -> None:
+    """Trains and evaluates in the folder `path` and writes its facts. exact: the simulator tells E[r], no network learns it.
 
     Raises Stopped once `stopping` holds, and RunFolderError if the folder is another run's or is in use.
     """
@@ -53,15 +54,16 @@ def run(path: Path, settings: Settings, stopping: Callable[[], bool]) -> None:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise RunFolderError(f'{path} is being trained by another process') from error
-        _train(path, settings, stopping)
+        _train(path, settings, stopping, exact)
 
 
-def _train(path: Path, settings: Settings, stopping: Callable[[], bool]) -> None:
+def _train(path: Path, settings: Settings, stopping: Callable[[], bool], exact: bool) -> None:
     ran_on = description()  # the commit may be another one by the end
     _adopt(path, settings)
     worlds = make_worlds(settings.task)
-    training = Training(settings, worlds.spec, RunFolder(path, settings))
-    learns_reward = settings.learner.estimator == 'dae' and settings.learner.beta > 0
+    recorder = AlternativesRecorder(worlds) if exact else None
+    training = Training(settings, worlds.spec, RunFolder(path, settings), recorder and recorder.expected_rewards)
+    learns_reward = settings.learner.estimator == 'dae' and settings.learner.beta > 0 and not exact
     credit = CreditLog(path / 'credit', training, worlds) if learns_reward else None
 
     def on_update() -> None:
@@ -73,7 +75,7 @@ def _train(path: Path, settings: Settings, stopping: Callable[[], bool]) -> None
             raise Stopped
 
     try:
-        train(training, worlds, on_update)
+        train(training, recorder or worlds, on_update)
         facts = {**_result(training), 'machine': ran_on, 'versions': versions(), 'settings': config.flatten(settings)}
         write_atomically(finished_file(path, training.environment_steps), (json.dumps(facts, indent=2) + '\n').encode())
     finally:
@@ -138,7 +140,8 @@ def main() -> None:
         signal.signal(number, lambda *_: asked.append(True))
     try:
         # Without its parent nobody would stop it, and it would hold the lock.
-        run(Path(sys.argv[1]), config.from_flat(json.loads(sys.argv[2])), lambda: bool(asked) or os.getppid() != parent)
+        run(Path(sys.argv[1]), config.from_flat(json.loads(sys.argv[2])), lambda: bool(asked) or os.getppid() != parent,
+            exact=sys.argv[3:] == [EXACT])
     except Stopped:
         sys.exit('stopped; it goes on from here when it is started again')
     except DaeRosError as error:

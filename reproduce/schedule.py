@@ -13,7 +13,7 @@ from typing import Sequence
 
 from benchmarks.machine import ROOT
 from dae_ros import config
-from reproduce.figures import Run
+from reproduce.figures import EXACT, Run
 from reproduce.progress import Progress
 from reproduce.records import Records
 
@@ -90,7 +90,8 @@ def _start(run: Run, records: Records) -> subprocess.Popen:
     path.mkdir(parents=True, exist_ok=True)
     with open(records.log_file(run), 'w') as log:
         # A session of its own: Ctrl-C reaches this process alone, which then stops the runs.
-        command = [sys.executable, '-m', 'reproduce.run', path.absolute(), json.dumps(config.flatten(run.settings))]
+        command = [sys.executable, '-m', 'reproduce.run', path.absolute(), json.dumps(config.flatten(run.settings)),
+                   *([EXACT] if run.exact else [])]
         return subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
 
 

@@ -232,3 +232,25 @@ def test_a_reward_network_without_memory_forgets_earlier_steps(recurrent, archit
     dae.update(one, 0)
     differs = (dae.expected_rewards(one) != dae.expected_rewards(other)).any(axis=(1, 2))
     assert differs[0] and (differs[1:] == recurrent).all()
+
+
+def test_with_exact_rewards_dae_subtracts_those_and_learns_no_reward_network():
+    trajectory = random_trajectory()
+    truth = np.random.default_rng(9).normal(size=trajectory.actions.shape)
+    told = []
+
+    def exact_rewards(rollout):
+        told.append(rollout)
+        return truth
+
+    learners = [Learner(SPEC, LEARNER, REWARD, 1, exact_rewards=exact_rewards),
+                Learner(SPEC, replace(LEARNER, beta=0.0), REWARD, 1)]
+    dae, gae = (estimate(one, trajectory) for one in learners)
+    continues = torch.tensor(1.0 - (trajectory.terminated | trajectory.truncated)).float()
+    baselines = advantages.credit_baselines(torch.tensor(truth).float(), continues, LEARNER.beta, LEARNER.gamma,
+                                            LEARNER.gae_lambda)
+    torch.testing.assert_close(dae, gae - baselines)
+    np.testing.assert_array_equal(told[0].actions, trajectory.actions)
+    assert not any('reward_network' in name for name in learners[0].state())
+    for one in learners:
+        one.close()

@@ -155,9 +155,9 @@ class Row(networks.Network):
     def steps(self):
         return [make(*arguments) for make, *arguments in self._steps]
 
-    def _table(self, actions):
+    def _table(self, actions, shared):
         if self.table is None:
-            return super()._table(actions)
+            return None
         return networks.Table(self.table, None if len(self.table) == actions.numel() else actions, lambda grad: [grad])
 
 
@@ -283,11 +283,28 @@ def test_reward_networks_and_their_gradients_equal_torch_in_double_precision(arc
 def test_table_of_the_others_actions_gives_what_each_agent_sees(architecture, N, A, C, monkeypatch):
     network, batch = map(double, reward_network(architecture, N, A, C))
     loss = reward_loss(network(*batch)[0].detach())
-    assert network._table(batch.actions).codes is not None
+    assert network._table(batch.actions, None).codes is not None
     with_table = results(network, batch, loss)
     monkeypatch.setattr(networks, '_LOOK_UP_BELOW', 0)
-    assert network._table(batch.actions).codes is None
+    assert network._table(batch.actions, None).codes is None
     torch.testing.assert_close(results(network, batch, loss), with_table)
+
+
+@ARCHITECTURES
+def test_parts_that_share_a_table_have_gradients_that_add_up_to_that_of_the_whole(architecture):
+    network, batch = reward_network(architecture, 3, 5, 50)
+    loss = reward_loss(network(*batch)[0].detach())
+    with torch.no_grad():
+        table = network.shared_table(batch.actions)
+        assert network.shared_table(batch.actions[:, :8]) is None
+
+    def of(columns):
+        cut = changed(batch, lambda x: x[:, columns])._replace(initial=batch.initial[columns])
+        return network.gradient(changed(loss, lambda x: x[:, columns]), *cut, shared=table)[0]
+
+    found = table.to_parameters(of(slice(0, 8)) + of(slice(8, 8)) + of(slice(8, 50)))
+    whole = network.gradient(loss, *batch)[0]
+    torch.testing.assert_close(found, whole, rtol=1e-4, atol=1e-5 * float(whole.abs().max()))
 
 
 def examples():
@@ -368,8 +385,8 @@ def test_what_a_column_gives_does_not_depend_on_the_columns_beside_it(all_exampl
     with torch.no_grad():
         outputs, states = network(*batch)
         for some in (slice(3, 29), slice(1, 12)):
-            looked_up = batch.actions is not None and network._table(batch.actions[:, some]).codes is not None
-            if batch.actions is not None and looked_up != (network._table(batch.actions).codes is not None):
+            looked_up = batch.actions is not None and network._table(batch.actions[:, some], None).codes is not None
+            if batch.actions is not None and looked_up != (network._table(batch.actions, None).codes is not None):
                 continue  # the table is torch's product, of other sizes
             part = Batch(batch.inputs[:, some], batch.initial[some], batch.episode_start[:, some],
                          None if batch.actions is None else batch.actions[:, some])

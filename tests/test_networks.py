@@ -270,7 +270,7 @@ def test_the_way_back_of_a_table_by_hand_is_that_of_autograd_to_the_network_s_fi
     network = reward_network(architecture).double()
     with torch.no_grad():
         network.action_bias.copy_(normal(*network.action_bias.shape))
-    table = network._table(some_actions(steps, 6))
+    table = network._table(some_actions(steps, 6), None)
     assert (table.codes is not None) == looked_up
     grad = normal(*table.rows.shape, dtype=torch.float64)
     by_hand = table.gradient(grad)

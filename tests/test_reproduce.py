@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -258,7 +259,8 @@ def pretend_run(run, records, level):
     path = records.path(run)
     log = MetricsLog(path)
     for update in range(1, run.updates + 1):
-        log.write(update * run.steps_per_update, {'mean_return': level + update, 'advantage/deviation': 1.0})
+        log.write(update * run.steps_per_update, {'mean_return': level + update, 'advantage/deviation': 1.0,
+                                                  'seconds/collecting': 0.5, 'seconds/learning': 1.5})
     log.close()
     facts = {'environment_steps': run.steps, 'seconds': 3600.0, 'evaluation_return': level, 'versions': {'python': '3'},
              'machine': {'processor': 'abacus', 'cores': 2, 'system': 'wood', 'commit': 'abc'}, 'settings': {'num_agents': 3}}
@@ -293,6 +295,27 @@ def test_an_average_leaves_out_a_team_size_that_a_curve_lacks(made_up):
     for each in figure.runs(figure.teams[1], 'low'):
         finished_file(records.path(each), each.steps).unlink()
     assert [team.num_agents for team in Curves(figure, records).averaged('navigation')] == [3]
+
+
+def test_a_figure_over_seconds_takes_the_time_of_the_updates(made_up):
+    figure, records = made_up
+    band = Curves(replace(figure, against='seconds'), records).band([figure.teams[0]], 'low', 'mean_return')
+    np.testing.assert_allclose(band.steps, 2.0 * np.arange(1, 1 + len(band.steps)))
+
+
+def test_a_scattered_figure_shows_where_every_seed_ended(made_up, tmp_path):
+    figure, records = made_up
+    for team in figure.teams:
+        for number, each in enumerate(figure.runs(team, 'high')[:2]):
+            log = MetricsLog(records.path(each) / 'credit')
+            log.write(each.steps, {'explained': 0.5 + number / 10, 'credit_explained': -1.0})
+            log.close()
+    scattered = replace(figure, against='expected_reward/explained', threshold=None, average=False)
+    curves = Curves(scattered, records)
+    ends = [seed.metrics['expected_reward/explained'][-1] for seed in curves.seeds[figure.teams[0], 'high']]
+    assert ends == [0.5, 0.6]
+    write_results([scattered], records, tmp_path)
+    assert (tmp_path / 'results/x.png').read_bytes().startswith(b'\x89PNG')
 
 
 def test_what_is_written_beside_the_markers_survives(made_up, tmp_path):

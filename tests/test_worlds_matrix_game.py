@@ -35,18 +35,6 @@ def test_agents_and_state_see_the_step_one_hot():
         joint = worlds.step(np.zeros((3, 4), dtype=np.int64)).next
 
 
-def test_agents_that_observe_their_number_see_it_after_the_step():
-    worlds = matrix_game(observe_id=True)
-    assert (worlds.spec.observation_size, worlds.spec.state_size) == (8, 4)
-    joint = worlds.reset(seed=1, rollout=0)
-    for step in range(6):
-        step_seen, number = joint.observations[..., :4], joint.observations[..., 4:]
-        np.testing.assert_array_equal(step_seen, np.broadcast_to(np.eye(4)[step % 4], (3, 4, 4)))
-        np.testing.assert_array_equal(number, np.broadcast_to(np.eye(4), (3, 4, 4)))
-        np.testing.assert_array_equal(joint.state, np.broadcast_to(np.eye(4)[step % 4], (3, 4)))
-        joint = worlds.step(np.zeros((3, 4), dtype=np.int64)).next
-
-
 def test_an_episode_terminates_when_every_agent_had_its_turn():
     worlds = matrix_game()
     worlds.reset(seed=1, rollout=0)

@@ -6,7 +6,7 @@ from mpe2 import simple_formation_v1, simple_line_v1, simple_spread_v3
 from mpe2._mpe_utils.core import World
 
 from dae_ros.config import TaskSettings
-from dae_ros.errors import SettingsError, WorldError
+from dae_ros.errors import WorldError
 from dae_ros.worlds import make_worlds
 
 PEERS = {'navigation': simple_spread_v3, 'formation': simple_formation_v1, 'line': simple_line_v1}
@@ -249,8 +249,3 @@ def test_actions_may_come_as_the_unsigned_integers_of_a_message():
 def test_worlds_must_be_reset_before_their_first_step():
     with pytest.raises(WorldError, match='reset'):
         particle_worlds('navigation').step(np.zeros((4, 3), dtype=np.int64))
-
-
-def test_numbers_of_robots_are_observed_in_the_matrix_game_alone():
-    with pytest.raises(SettingsError, match='observe_id belongs to the matrix game; set it to false for line'):
-        particle_worlds('line', 4, observe_id=True)

@@ -234,8 +234,6 @@ def test_an_episode_length_that_the_environment_does_not_take_is_refused(tiny):
 def test_settings_of_other_tasks_are_refused():
     with pytest.raises(SettingsError, match='observe_others'):
         spread(observe_others=True)
-    with pytest.raises(SettingsError, match='observe_id'):
-        spread(observe_id=True)
     with pytest.raises(SettingsError, match='reward_delay belongs to the built-in tasks; set it to 0'):
         spread(reward_delay=1)
 

@@ -19,6 +19,7 @@ from dae_ros import config, torchrun
 from dae_ros.config import Settings
 from dae_ros.errors import DaeRosError
 from dae_ros.learning.device import chosen_device
+from dae_ros.learning.estimators import ExpectedRewards
 from dae_ros.learning.learner import Learner
 from dae_ros.types import Trajectory, WorldSpec
 
@@ -75,11 +76,12 @@ class LeadingLearner(Learner):
         super().close()
 
 
-def make_learner(spec: WorldSpec, settings: Settings) -> Learner:
-    """The learner of this process, which leads a team if torchrun started several."""
+def make_learner(spec: WorldSpec, settings: Settings, exact_rewards: ExpectedRewards | None = None) -> Learner:
+    """The learner of this process, which leads a team if torchrun started several; only a learner alone takes exact rewards."""
     if torchrun.size() > 1:
         return LeadingLearner(spec, settings, Team())
-    return Learner(spec, settings.learner, settings.reward_network, settings.run.seed, device=chosen_device(spec, settings))
+    return Learner(spec, settings.learner, settings.reward_network, settings.run.seed, device=chosen_device(spec, settings),
+                   exact_rewards=exact_rewards)
 
 
 def help_to_learn() -> None:

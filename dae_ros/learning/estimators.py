@@ -7,21 +7,24 @@ of its networks on that rollout. The actor's training is the same whatever the e
 from __future__ import annotations
 
 from functools import partial
-from typing import Iterable, Mapping, NamedTuple
+from typing import Callable, Iterable, Mapping, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.learning import advantages, losses
 from dae_ros.learning.chunks import ActionChunks, ValueChunks, first_states, to_chunks
-from dae_ros.learning.networks import RewardNetwork, make_action_value_network, make_critic, make_reward_network
+from dae_ros.learning.networks import RewardNetwork, Table, make_action_value_network, make_critic, make_reward_network
 from dae_ros.learning.optimizer import FlatAdam
 from dae_ros.learning.parallel import Training
 from dae_ros.learning.passes import Batch, Passes
 from dae_ros.learning.reward_replay import RewardReplay
 from dae_ros.learning.value_norm import ValueNormalizer
 from dae_ros.types import Trajectory, WorldSpec
+
+ExpectedRewards = Callable[[Trajectory], np.ndarray]  # E over a_i ~ pi_i of the reward in a rollout, [T, W, N]
 
 
 class Estimate(NamedTuple):
@@ -53,22 +56,27 @@ class ActionNetwork:
         """Gradient steps of half the squared error on batches of `ActionChunks`."""
         network = self.adam.network
 
-        def gradient(shard: ActionChunks, initial: Tensor) -> tuple[Tensor, Tensor]:
+        def gradient(shard: ActionChunks, initial: Tensor, shared: Table | None = None) -> tuple[Tensor, Tensor]:
             loss = losses.RewardLoss(shard.actions, shard.targets, shard.weights / network.num_agents)
-            return network.gradient(loss, shard.inputs, initial, shard.episode_start, shard.actions)
+            return network.gradient(loss, shard.inputs, initial, shard.episode_start, shard.actions, shared)
 
-        return self._passes.train(self.name, self.adam, gradient, batches, network.num_agents, (loss_name,))
+        @torch.no_grad()
+        def shared(chunks: ActionChunks) -> Table | None:
+            return network.shared_table(chunks.actions)
+
+        return self._passes.train(self.name, self.adam, gradient, batches, network.num_agents, (loss_name,), shared)
 
 
 class DifferenceEstimator:
     """DAE (section 3.3): GAE of a central critic, less what each agent's reward was to be expected without knowing its action.
 
-    At beta = 0 it is GAE, has no reward network and is plain MAPPO.
+    At beta = 0 it is GAE, has no reward network and is plain MAPPO. Nor has it one where `exact_rewards` tells E[r].
     """
 
     def __init__(self, spec: WorldSpec, settings: LearnerSettings, reward_settings: RewardNetworkSettings, seed: int,
-                 passes: Passes):
+                 passes: Passes, exact_rewards: ExpectedRewards | None = None):
         self._settings = settings
+        self._exact_rewards = exact_rewards
         self._reward_settings = reward_settings
         self._passes = passes
         self._critic = FlatAdam(make_critic(spec, settings, seed).to(passes.device), settings.learning_rate,
@@ -76,7 +84,7 @@ class DifferenceEstimator:
         self._value_norm = ValueNormalizer()
         self._reward = [ActionNetwork(f'reward_network.{member}', make_reward_network(spec, reward_settings, seed, member),
                                       reward_settings.learning_rate, settings, passes)
-                        for member in range(reward_settings.ensemble_size if settings.beta > 0 else 0)]
+                        for member in range(reward_settings.ensemble_size if settings.beta > 0 and not exact_rewards else 0)]
         replays = self._reward and reward_settings.replay_rollouts and not reward_settings.freeze
         self._replay = RewardReplay(reward_settings, seed) if replays else None
 
@@ -92,19 +100,23 @@ class DifferenceEstimator:
         next_values[data.truncated] = self._value_norm.denormalize(final_values)
         team = advantages.generalized_advantages(data.rewards, values[:-1], next_values, continues, settings.gamma,
                                                  settings.gae_lambda)
-        estimated = team.unsqueeze(-1).expand(data.actions.shape)
-        if self._reward:
+        expected = None
+        if self._exact_rewards is not None:
+            expected = torch.from_numpy(self._exact_rewards(Trajectory(*(part.cpu().numpy() for part in data)))).to(team)
+        elif self._reward:
             remembered = as_remembered(data, self._reward_settings)
             predicted, inputs, states = self._predicted_rewards(remembered)
             expected = advantages.expected_rewards(predicted, data.probabilities)
-            estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
-                                                                settings.gae_lambda)
             taken = advantages.of_actions(predicted, data.actions)
             error = (taken - data.rewards.unsqueeze(-1)).square().mean()
             metrics['reward_network/explained_variance'] = float(
                 1 - error / data.rewards.var(correction=0).clamp_min(1e-12))
             if not self._reward_settings.freeze:
                 trainings = self._reward_trainings(remembered, inputs, states, rollout)
+        estimated = team.unsqueeze(-1).expand(data.actions.shape)
+        if expected is not None:
+            estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
+                                                                settings.gae_lambda)
 
         # Line 20: value targets; the critic sees one state per world, so it regresses on the agents' mean.
         targets = values[:-1] + (estimated.mean(-1) if settings.value_target == 'difference' else team)

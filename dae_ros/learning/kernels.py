@@ -73,18 +73,18 @@ def forward(steps: Sequence[Step], batch: Batch) -> tuple[Tensor, Tensor]:
 
 
 def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
-             loss: LossTerms) -> tuple[Tensor, Tensor | None, Tensor]:
+             loss: LossTerms) -> tuple[Tensor, Tensor]:
     """Gradient of a loss of what `forward` gives.
 
     parameters: those of the steps, and others. Returns their gradients one after another in one flat vector, zeros for
-    the others; the table's gradient [K, O]; and the loss's sums [4], of which the kind of loss says how many there are.
+    the others, and behind them that of the table [K, O]; and the loss's sums [4], of which the kind of loss says how many
+    there are.
     """
-    flat = torch.zeros(sum(parameter.numel() for parameter in parameters))
+    flat = torch.zeros(sum(x.numel() for x in (*parameters, batch.table) if x is not None))
     gradients, address = {}, flat.data_ptr()
     for parameter in parameters:
         gradients[parameter.data_ptr()] = address
         address += 4 * parameter.numel()
-    grad_table = None if batch.table is None else torch.zeros_like(batch.table)
     sums = torch.zeros(_MOST_SUMS, dtype=torch.float64)
     kept: list[Tensor] = []
     columns = batch.episode_start.shape
@@ -97,9 +97,9 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
     data = [_array(x, shape, torch.float32, kept) for x in (*loss.data, None)[:2]]
     terms = CLoss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _array(loss.actions, agents, torch.int64, kept),
                   (CArray * 2)(*data), _array(loss.weights, columns, torch.float32, kept))
-    _check(library.network_gradient(_steps(steps, gradients), len(steps), _batch(steps, batch, kept), terms, _address(grad_table),
-                                    sums.data_ptr()))
-    return flat, grad_table, sums.float()
+    _check(library.network_gradient(_steps(steps, gradients), len(steps), _batch(steps, batch, kept), terms,
+                                    None if batch.table is None else address, sums.data_ptr()))
+    return flat, sums.float()
 
 
 def _rows(steps: Sequence[Step], batch: Batch) -> tuple[int, int, int]:
@@ -163,10 +163,6 @@ def _array(tensor: Tensor | None, shape: Sequence[int], dtype: torch.dtype, kept
     kept.append(tensor)
     step, column = tensor.stride()[:2]
     return CArray(tensor.data_ptr(), step // inner, column // inner)
-
-
-def _address(tensor: Tensor | None) -> int | None:
-    return None if tensor is None else tensor.data_ptr()
 
 
 def _check(failed: int) -> None:

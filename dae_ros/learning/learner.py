@@ -17,7 +17,7 @@ from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.errors import SettingsError
 from dae_ros.learning import advantages, losses
 from dae_ros.learning.chunks import PolicyChunks, first_states, to_chunks
-from dae_ros.learning.estimators import ESTIMATORS, DifferenceEstimator, chunk_length
+from dae_ros.learning.estimators import ESTIMATORS, DifferenceEstimator, ExpectedRewards, chunk_length
 from dae_ros.learning.networks import make_actor
 from dae_ros.learning.optimizer import FlatAdam
 from dae_ros.learning.parallel import Training
@@ -30,14 +30,16 @@ class Learner:
     """Actor, estimator and how they learn in one run."""
 
     def __init__(self, spec: WorldSpec, settings: LearnerSettings, reward_settings: RewardNetworkSettings, seed: int,
-                 team=None, device: torch.device = torch.device('cpu')):
-        """`team`: the `distributed.Team` this process learns with, None to learn alone. `device`: where it computes."""
+                 team=None, device: torch.device = torch.device('cpu'), exact_rewards: ExpectedRewards | None = None):
+        """`team`: the `distributed.Team` this process learns with, None to learn alone. `device`: where it computes.
+        `exact_rewards`: tells DAE the truth about E[r], in place of reward networks; for studies in simulators."""
         self._spec = spec
         self._settings = settings
         self._passes = Passes(settings.learner_threads, seed, device, team)
         self._actor = FlatAdam(make_actor(spec, settings, seed).to(device), settings.learning_rate, settings.adam_epsilon,
                                settings.max_gradient_norm)
-        self._estimator = ESTIMATORS[settings.estimator](spec, settings, reward_settings, seed, self._passes)
+        told = {} if exact_rewards is None else {'exact_rewards': exact_rewards}
+        self._estimator = ESTIMATORS[settings.estimator](spec, settings, reward_settings, seed, self._passes, **told)
 
     @property
     def policy(self) -> Policy:
@@ -80,7 +82,7 @@ class Learner:
 
         Raises SettingsError if there is none to be replaced.
         """
-        if not isinstance(self._estimator, DifferenceEstimator) or not self._settings.beta:
+        if 'reward_network.0' not in self._networks():
             raise SettingsError('reward_network.path needs the reward network that estimator = dae has at beta above 0')
         self._estimator.begin_with([{f'parameters.{name}': torch.from_numpy(tensor) for name, tensor in parameters.items()}
                                     for parameters in reward_networks])

@@ -82,10 +82,19 @@ def run_in_torch(steps: Iterable[Step], batch: Batch) -> tuple[Tensor, Tensor | 
 class Table(NamedTuple):
     """What a fan-out adds: `Batch.table` and `Batch.codes`, and the way back to the parameters they depend on."""
 
-    rows: Tensor | None
+    rows: Tensor
     codes: Tensor | None
     # From the gradient of `rows`, those of the network's first parameters, by hand: autograd takes three times as long.
     gradient: Callable[[Tensor], Sequence[Tensor]]
+
+    @torch.no_grad()
+    def to_parameters(self, flat: Tensor) -> Tensor:
+        """The gradient of all parameters, from those of the steps' parameters and, behind them, of `rows`."""
+        behind = len(flat) - self.rows.numel()
+        parts = [part.reshape(-1) for part in self.gradient(flat[behind:].view_as(self.rows))]
+        flat = flat[:behind]
+        torch.cat(parts, out=flat[:sum(map(len, parts))])
+        return flat
 
 
 class Network(nn.Module):
@@ -102,9 +111,9 @@ class Network(nn.Module):
         """Parameters and steps, collected once: a thousand gradients a second need them."""
         return tuple(self.parameters()), self.steps()
 
-    def _table(self, actions: Tensor | None) -> Table:
-        """What a fan-out adds."""
-        return Table(None, None, lambda grad: ())
+    def _table(self, actions: Tensor | None, shared: Table | None) -> Table | None:
+        """What a fan-out adds, None if there is none; `shared`: as far as it has been computed."""
+        return None
 
     def forward(self, inputs: Tensor, initial: Tensor, episode_start: Tensor,
                 actions: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -114,33 +123,47 @@ class Network(nn.Module):
         for networks that see them. With gradients enabled this is torch; see `gradient`.
         """
         _, steps = self._own
-        batch = _batch(inputs, initial, episode_start, actions, self._table(actions))
+        batch = _batch(inputs, initial, episode_start, actions, self._table(actions, None))
         if kernels.usable(inputs) and not torch.is_grad_enabled():
             return kernels.forward(steps, batch)
         return run_in_torch(steps, batch)
 
     def gradient(self, loss: Loss, inputs: Tensor, initial: Tensor, episode_start: Tensor,
-                 actions: Tensor | None = None) -> tuple[Tensor, Tensor]:
+                 actions: Tensor | None = None, shared: Table | None = None) -> tuple[Tensor, Tensor]:
         """d loss / d parameters as one flat vector, and the sums of the loss; the rest as for `forward`.
 
-        Leaves no trace on the parameters, so that threads may share the network.
+        With the table of a larger batch, which is `shared` by its parts, the vector ends with the gradient of its rows;
+        those of the parts are added up before `Table.to_parameters`. Leaves no trace on the parameters, so that threads
+        may share the network.
         """
         parameters, steps = self._own
-        with torch.set_grad_enabled(not kernels.usable(inputs)):
-            table = self._table(actions)
+        with torch.no_grad():
+            table = self._table(actions, shared)
             batch = _batch(inputs, initial, episode_start, actions, table)
-            if torch.is_grad_enabled():
-                objective, sums = loss(run_in_torch(steps, batch)[0])
-                return torch.cat([part.reshape(-1) for part in torch.autograd.grad(objective, parameters)]), sums
-            flat, grad_table, sums = kernels.gradient(steps, parameters, batch, loss.terms)
-            parts = [part.reshape(-1) for part in table.gradient(grad_table)]
-            if parts:
-                torch.cat(parts, out=flat[:sum(map(len, parts))])
+            if kernels.usable(inputs):
+                flat, sums = kernels.gradient(steps, parameters, batch, loss.terms)
+            else:
+                flat, sums = _gradient_in_torch(steps, parameters, batch, loss)
+            if table is not None and shared is None:
+                flat = table.to_parameters(flat)
         return flat, sums[:len(loss.sums)]
 
 
-def _batch(inputs: Tensor, initial: Tensor, episode_start: Tensor, actions: Tensor | None, table: Table) -> Batch:
-    return Batch(inputs, initial, episode_start, (inputs if actions is None else actions).shape[2], table.rows, table.codes)
+def _gradient_in_torch(steps: Iterable[Step], parameters: Sequence[Tensor], batch: Batch, loss: Loss) -> tuple[Tensor, Tensor]:
+    """What `kernels.gradient` computes."""
+    leaves = list(parameters)
+    with torch.enable_grad():
+        if batch.table is not None:
+            leaves.append(batch.table.detach().requires_grad_())
+            batch = batch._replace(table=leaves[-1])
+        objective, sums = loss(run_in_torch(steps, batch)[0])
+    parts = torch.autograd.grad(objective, leaves, allow_unused=True, materialize_grads=True)
+    return torch.cat([part.reshape(-1) for part in parts]), sums
+
+
+def _batch(inputs: Tensor, initial: Tensor, episode_start: Tensor, actions: Tensor | None, table: Table | None) -> Batch:
+    rows, codes = (None, None) if table is None else table[:2]
+    return Batch(inputs, initial, episode_start, (inputs if actions is None else actions).shape[2], rows, codes)
 
 
 class RecurrentNetwork(Network):
@@ -187,8 +210,8 @@ class RewardNetwork(Network):
     """r_psi(s, a_-i, .): for every agent the shared reward for each action of its own (paper, section 3.3).
 
     The zeroed block of agent i's own action is the only thing that tells the agents apart, so what depends on the others'
-    actions alone is computed once for all they can do, where that is less than the batch (75 rows for three agents with
-    five actions).
+    actions alone is computed once a gradient step for all they can do, where that is less than half of what they did (75
+    rows for three agents with five actions).
     """
 
     def __init__(self, spec: WorldSpec, settings: RewardNetworkSettings):
@@ -207,30 +230,39 @@ class RewardNetwork(Network):
         """Recurrent states per world: N or 1."""
         raise NotImplementedError
 
-    def _table(self, actions: Tensor) -> Table:
-        """joint_action(relu(embedding of the others' actions)) for actions [L, C, N]."""
+    def shared_table(self, actions: Tensor) -> Table | None:
+        """What the parts of a batch with actions [L, C, N] can share: joint_action(relu(embedding)) of everything the others
+        can do. None if that is more than half of what they did."""
         N, A = self.num_agents, self.num_actions
-        if N * A ** (N - 1) <= _LOOK_UP_BELOW * actions.numel():
-            hot, place, first = _joint_actions_of_others(N, A, actions.device)
-            hot = hot.to(self.action_bias.dtype)
-            others, codes = hot @ self.action_embedding, (actions.float() @ place).long() + first
+        if N * A ** (N - 1) > _LOOK_UP_BELOW * actions.numel():
+            return None
+        hot = _joint_actions_of_others(N, A, actions.device)[0].to(self.action_bias.dtype)
+        return self._table_of(torch.addmm(self.action_bias, hot, self.action_embedding), lambda grad: hot.t() @ grad)
 
-            def to_embedding(grad: Tensor) -> Tensor:
-                return hot.t() @ grad
-        else:
-            taken = actions + torch.arange(N, device=actions.device) * A
-            others, codes = _of_others(functional.embedding(taken, self.action_embedding)), None
+    def _table(self, actions: Tensor, shared: Table | None) -> Table:
+        N, A = self.num_agents, self.num_actions
+        table = shared or self.shared_table(actions)
+        if table is not None:
+            _, place, first = _joint_actions_of_others(N, A, actions.device)
+            return table._replace(codes=(actions.float() @ place).long() + first)
+        taken = actions + torch.arange(N, device=actions.device) * A
 
-            def to_embedding(grad: Tensor) -> Tensor:
-                to_each = _of_others(grad.view(*taken.shape, grad.shape[-1]))
-                return torch.zeros_like(self.action_embedding).index_add_(0, taken.flatten(), to_each)
-        hidden = torch.relu(others + self.action_bias)
+        def to_embedding(grad: Tensor) -> Tensor:
+            to_each = _of_others(grad.view(*taken.shape, grad.shape[-1]))
+            return torch.zeros_like(self.action_embedding).index_add_(0, taken.flatten(), to_each)
+
+        others = _of_others(functional.embedding(taken, self.action_embedding))
+        return self._table_of(others + self.action_bias, to_embedding)
+
+    def _table_of(self, others: Tensor, to_embedding: Callable[[Tensor], Tensor]) -> Table:
+        """joint_action(relu(others)), the others' embedding and the bias; `to_embedding` takes the gradient of `others` back."""
+        hidden = torch.relu(others)
 
         def gradient(grad: Tensor) -> Sequence[Tensor]:
-            to_hidden = (grad @ self.joint_action.weight).mul_(hidden > 0)
+            to_hidden = torch.ops.aten.threshold_backward(grad @ self.joint_action.weight, hidden, 0)  # relu's
             return to_embedding(to_hidden), to_hidden.sum(0), grad.t() @ hidden, grad.sum(0)
 
-        return Table(self.joint_action(hidden), codes, gradient)
+        return Table(self.joint_action(hidden), None, gradient)
 
 
 class PerAgentRewardNetwork(RewardNetwork):

@@ -6,7 +6,7 @@ threads. A `distributed.Team` shares the shards of every gradient step among its
 
 from __future__ import annotations
 
-from functools import partial
+from functools import partial, reduce
 from typing import Callable, Iterable, Iterator, Tuple
 
 import torch
@@ -14,12 +14,12 @@ from torch import Tensor
 
 from dae_ros import draws
 from dae_ros.learning.chunks import Chunks, chosen_chunks, shard_bounds
-from dae_ros.learning.networks import Network
+from dae_ros.learning.networks import Network, Table
 from dae_ros.learning.optimizer import FlatAdam
 from dae_ros.learning.parallel import Training, Workers
 
 Batch = Tuple[Chunks, Tensor]  # chunks, and the recurrent states [C, ...] before their first steps
-Gradient = Callable[[Chunks, Tensor], Tuple[Tensor, Tensor]]  # of a batch: the flat gradient, and sums of the loss
+Gradient = Callable[..., Tuple[Tensor, Tensor]]  # of a batch, and a table if shared: the flat gradient, and sums of the loss
 
 
 class Passes:
@@ -56,17 +56,21 @@ class Passes:
                 yield chosen_chunks(chunks, chosen), initial[chosen]
 
     def train(self, name: str, adam: FlatAdam, gradient: Gradient, batches: Iterable[Batch], rows_per_chunk: int,
-              metric_names: tuple[str, ...]) -> Training:
+              metric_names: tuple[str, ...], shared: Callable[[Chunks], Table | None] = lambda chunks: None) -> Training:
         """Gradient steps of one network, for `run`; returns its metrics, averaged over the steps.
 
         Yields the shards of a gradient step as tasks, `rows_per_chunk` rows in each chunk, and is sent their results.
+        `shared` makes the table that the shards of a step share, if there is one.
         """
         totals, norms, steps, cut, shards = torch.zeros(len(metric_names), device=self.device), 0.0, 0, None, []
         for batch in batches:
             if batch is not cut:
                 cut, shards = batch, self._shards(*batch, rows_per_chunk)
-            answers = yield [partial(gradient, *shard) for shard in shards]
-            norms += adam.step(sum(flat for flat, _ in answers))
+            table = shared(batch[0])
+            task = gradient if table is None else partial(gradient, shared=table)
+            answers = yield [partial(task, *shard) for shard in shards]
+            flat = reduce(Tensor.add_, (flat for flat, _ in answers))  # in place: with a table it is megabytes
+            norms += adam.step(flat if table is None else table.to_parameters(flat))
             totals += sum(terms for _, terms in answers)
             steps += 1
         return dict(zip(metric_names, (totals / steps).tolist())) | {f'{name}/gradient_norm': norms / steps}

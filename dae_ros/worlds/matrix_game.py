@@ -13,8 +13,7 @@ from dae_ros.worlds.synchronous import SynchronousWorlds
 class MatrixGame(SynchronousWorlds):
     """Reward u - (N + 1) / 2 for the action u in 1 .. N of agent t at step t; the best return is N (N - 1) / 2.
 
-    Every agent observes the step, one-hot, and with `observe_id` after it its own number. The state is the step alone, as N
-    copies of it hold nothing more.
+    Every agent observes the step, one-hot. The state is that one vector too, as N copies of it hold nothing more.
     """
 
     def __init__(self, task: TaskSettings):
@@ -24,8 +23,7 @@ class MatrixGame(SynchronousWorlds):
                                 f'not {task.episode_steps}')
         if task.observe_others:
             raise SettingsError('observe_others belongs to formation and line; set it to false for the matrix game')
-        size = 2 * num_agents if task.observe_id else num_agents
-        spec = WorldSpec(num_agents, num_agents, size, num_agents, state_is_observations=False)
+        spec = WorldSpec(num_agents, num_agents, num_agents, num_agents, state_is_observations=False)
         super().__init__(spec, task, task.episode_steps or num_agents)
         self._turn = 0  # step of the episode, and the agent whose action counts there
         self._reward = np.zeros(task.num_worlds)
@@ -50,10 +48,6 @@ class MatrixGame(SynchronousWorlds):
         return action + 1 - (self.spec.num_agents + 1) / 2
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
-        W, N, size = self.num_worlds, self.spec.num_agents, self.spec.observation_size
-        state = np.zeros((W, N), dtype=np.float32)
-        state[:, self._turn] = 1.0
-        observations = np.empty((W, N, size), dtype=np.float32)
-        observations[:, :, :N] = state[:, None]
-        observations[:, :, N:] = np.eye(N)[:, :size - N]
-        return observations, state
+        observations = np.zeros((self.num_worlds, self.spec.num_agents, self.spec.observation_size), dtype=np.float32)
+        observations[:, :, self._turn] = 1.0
+        return observations, observations[:, 0].copy()

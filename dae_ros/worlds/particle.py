@@ -15,7 +15,6 @@ from functools import cached_property
 import numpy as np
 
 from dae_ros.config import TaskSettings
-from dae_ros.errors import SettingsError
 from dae_ros.types import WorldSpec
 from dae_ros.worlds.synchronous import SynchronousWorlds
 
@@ -41,8 +40,6 @@ class ParticleWorlds(SynchronousWorlds):
     num_landmark_draws: int  # uniform numbers that `_place_landmarks` needs per world
 
     def __init__(self, task: TaskSettings, num_landmarks: int, observe_others: bool, unused_features: int = 0):
-        if task.observe_id:
-            raise SettingsError(f'observe_id belongs to the matrix game; set it to false for {task.task}')
         num_agents, num_worlds = task.num_agents, task.num_worlds
         num_others = num_agents - 1 if observe_others else 0
         size = 4 + 2 * num_landmarks + 2 * num_others + unused_features

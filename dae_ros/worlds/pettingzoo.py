@@ -35,8 +35,6 @@ class PettingZooWorlds(Worlds):
 
     def __init__(self, task: TaskSettings):
         self._name = task.task
-        if task.observe_id:
-            raise SettingsError(f'observe_id belongs to the matrix game; set it to false for {self._name}')
         if task.observe_others:
             raise SettingsError(f'observe_others belongs to formation and line; set it to false for {self._name}')
         if task.reward_delay:

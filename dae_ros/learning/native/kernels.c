@@ -6,7 +6,8 @@
  * the row's place in a block or the thread.
  *
  * A batch goes through its network in blocks of a few columns, forward, loss and backward, so that what the backward
- * pass needs of the forward pass is still in the cache.
+ * pass needs of the forward pass is still in the cache. Past the last GRU and fan-out a row is on its own: these steps
+ * take a block in parts of a few rows.
  *
  * Products run on register tiles of ROWS x COLUMNS. Their right operand is packed into panels of COLUMNS columns,
  * zero-padded, once per call or, for a policy, once and for all; a panel's block of DEPTH rows stays in the first-level
@@ -32,7 +33,7 @@
 #endif
 #endif
 
-enum { ROWS = 6, COLUMNS = 2 * LANES, DEPTH = 4096 / COLUMNS, BLOCK = 48 };
+enum { ROWS = 6, COLUMNS = 2 * LANES, DEPTH = 4096 / COLUMNS, BLOCK = 48, PART = 2 * BLOCK };
 enum { IDENTITY = 0, RELU = 1, TANH = 2 };
 
 typedef float vec __attribute__((vector_size(LANES * 4)));
@@ -422,7 +423,7 @@ typedef struct {
     const float *table;   /* [K, O] what FAN_OUT adds */
 } Batch;
 
-/* One step at work on a block of `rows` rows per column and `count` rows in all. */
+/* One step at work on a block, or a part of one, of `rows` rows per column and `count` rows in all. */
 typedef struct {
     long rows, count;
     float *forward, *backward, *backward_state;        /* packed weights */
@@ -438,7 +439,8 @@ typedef struct {
     float *right, *right_state;                    /* their right factors */
     float *bias;                                   /* [4 H] */
     float *layer_gradient;                         /* [BLOCK, O] */
-    float *from_above, *to_below;                  /* gradients between steps */
+    float *from_above, *to_below;                  /* gradients between steps, */
+    float *from_part, *to_part;                    /* and between those that take parts */
     float *inputs;
     uint8_t *start;
     int64_t *codes, *actions;
@@ -795,34 +797,49 @@ static void layer_backward(const Step *step, const Work *work, const float *x, c
     }
 }
 
+/* Rows of a table lie anywhere in it: the processor is told of each AHEAD rows before it is used. */
+enum { AHEAD = 4 };
+
+INLINE void prefetch_row(const float *row, long O) {
+    for (long j = 0; j < O; j += 16)
+        __builtin_prefetch(row + j);
+}
+
 /* y[row] = LayerNorm(relu(table[code of row] + x[row / N])). */
-static void fan_out_forward(const Step *step, const Work *work, long N, const float *table, const float *x,
-                            const Scratch *s) {
+static void fan_out_forward(const Step *step, const Work *work, long N, const float *table, const int64_t *codes,
+                            const float *x) {
     const long O = step->outputs;
     for (long first = 0; first < work->count; first += BLOCK) {
         const long end = min(first + BLOCK, work->count);
-        for (long row = first; row < end; row++)
-            activate_row(O, RELU, table + s->codes[row] * O, x + row / N * O, work->activated + row * O,
+        for (long row = first; row < end; row++) {
+            if (row + AHEAD < work->count)
+                prefetch_row(table + codes[row + AHEAD] * O, O);
+            activate_row(O, RELU, table + codes[row] * O, x + row / N * O, work->activated + row * O,
                          work->statistics + 2 * row);
+        }
         normalise(end - first, O, work->activated + first * O, step->parameters[2], step->parameters[3],
                   work->statistics + 2 * first, work->y + first * O);
     }
 }
 
+/* grad_x may be NULL if nobody needs it. */
 static void fan_out_backward(const Step *step, const Work *work, long N, const float *grad_y, float *grad_table,
-                             float *grad_x, const Scratch *s) {
+                             const int64_t *codes, float *grad_x, const Scratch *s) {
     const long O = step->outputs;
     const float *scale = step->parameters[2];
-    memset(grad_x, 0, (size_t)(work->count / N * O) * sizeof(float));
+    if (grad_x)
+        memset(grad_x, 0, (size_t)(work->count / N * O) * sizeof(float));
     float means[2 * BLOCK];
     for (long first = 0; first < work->count; first += BLOCK) {
         const long end = min(first + BLOCK, work->count);
         normalise_backward(end - first, O, work->activated + first * O, work->statistics + 2 * first, scale,
                            grad_y + first * O, step->gradients[2], step->gradients[3], means);
         for (long row = first; row < end; row++) {
-            float *to = grad_table + s->codes[row] * O, *grad = s->layer_gradient;
+            float *to = grad_table + codes[row] * O, *grad = s->layer_gradient;
+            if (row + AHEAD < work->count)
+                prefetch_row(grad_table + codes[row + AHEAD] * O, O);
             row_backward(O, RELU, work->activated + row * O, work->statistics + 2 * row, means + 2 * (row - first), scale,
-                         grad_y + row * O, grad, grad_x + row / N * O);
+                         grad_y + row * O, grad, grad_x ? grad_x + row / N * O : NULL);
             FOR_EACH_VECTOR(O, { add_to(to + j, load_upto(grad + j, lanes), lanes); });
         }
     }
@@ -933,6 +950,17 @@ static long rows_at_gru(const Step *steps, long count, const Batch *batch) {
     return rows;
 }
 
+/* The first step of those that take a block in parts. */
+static long first_in_parts(const Step *steps, long count) {
+    long first = 0;
+    for (long i = 0; i < count; i++)
+        first = steps[i].kind == GRU ? i + 1 : steps[i].kind == FAN_OUT ? i : first;
+    return first;
+}
+
+/* How many of a block's `length` steps of columns a part has. */
+static long part_size(const Batch *batch, long length) { return max(1, min(length, PART / batch->agents)); }
+
 /* Hands out the memory of the packed weights; those of the backward pass only if the network `learns`. */
 static void plan_weights(Arena *arena, const Step *steps, long count, int learns, Work *works) {
     for (long i = 0; i < count; i++) {
@@ -969,15 +997,16 @@ static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *ba
                     Work *works) {
     Scratch s = {0};
     const long length = batch->length * columns, all_rows = length * batch->agents;
-    long rows = batch->rows, widest = 1, inputs = 1, outputs = 1, units = 1;
+    const long in_parts = first_in_parts(steps, count), part = part_size(batch, length);
+    long rows = batch->rows, widest = 1, widest_part = 1, inputs = 1, outputs = 1, units = 1;
     for (long i = 0; i < count; i++) {
         const Step *step = steps + i;
         const long I = step->inputs, O = step->outputs;
         rows = step->kind == FAN_OUT ? batch->agents : rows;
         Work *work = works + i;
         work->rows = rows;
-        work->count = length * rows;
-        work->y = take(arena, work->count * O);
+        work->count = (i < in_parts ? length : part) * rows;
+        work->y = take(arena, (i == count - 1 ? length * rows : work->count) * O);
         work->activated = keeps_activated(step) || step->kind == FAN_OUT ? take(arena, work->count * O) : NULL;
         work->statistics = take(arena, 2 * work->count);
         if (step->kind == GRU) {
@@ -986,7 +1015,10 @@ static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *ba
         }
         inputs = max(inputs, I);
         outputs = max(outputs, O);
-        widest = max(widest, work->count * max(O, i ? I : 0));
+        if (i < in_parts)
+            widest = max(widest, work->count * max(O, i ? I : 0));
+        else
+            widest_part = max(widest_part, work->count * max(O, I));
     }
     s.inputs = take(arena, length * batch->rows * steps[0].inputs);
     s.products = take(arena, 4 * BLOCK * COLUMNS);
@@ -1007,6 +1039,8 @@ static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *ba
     s.layer_gradient = take(arena, BLOCK * outputs);
     s.from_above = take(arena, widest);
     s.to_below = take(arena, widest);
+    s.from_part = take(arena, widest_part);
+    s.to_part = take(arena, widest_part);
     s.actions = take_bytes(arena, all_rows * (long)sizeof(int64_t));
     s.of_loss[0] = take(arena, all_rows);
     s.of_loss[1] = take(arena, all_rows);
@@ -1035,70 +1069,116 @@ static void scatter(long L, long C, long first, long columns, long bytes, const 
         memcpy((char *)to + (t * C + first) * bytes, (const char *)from + t * columns * bytes, (size_t)(columns * bytes));
 }
 
-static void forward_block(const Step *steps, long count, const Batch *batch, long first, long columns, Work *works,
-                          Scratch *s) {
-    const long L = batch->length, C = batch->columns, N = batch->agents;
-    gather(&batch->inputs, L, first, columns, batch->rows * steps[0].inputs * (long)sizeof(float), s->inputs);
+/* A LAYER or a FAN_OUT. */
+static void rows_forward(const Step *step, const Work *work, const Batch *batch, const float *x, const int64_t *codes) {
+    if (step->kind == FAN_OUT)
+        fan_out_forward(step, work, batch->agents, batch->table, codes, x);
+    else
+        layer_forward(step, work, x);
+}
+
+static void rows_backward(const Step *step, const Work *work, const Batch *batch, const float *x, const float *grad_y,
+                          float *grad_table, float *grad_x, const Scratch *s) {
+    if (step->kind == FAN_OUT)
+        fan_out_backward(step, work, batch->agents, grad_y, grad_table, s->codes, grad_x, s);
+    else
+        layer_backward(step, work, x, grad_y, grad_x, s);
+}
+
+/* Gathers what belongs to a block of columns and takes it through the first `count` steps. */
+static void forward_block(const Step *steps, long count, const Batch *batch, const Loss *loss, long first, long columns,
+                          Work *works, Scratch *s) {
+    const long L = batch->length, C = batch->columns, N = batch->agents, size = (long)sizeof(float);
+    gather(&batch->inputs, L, first, columns, batch->rows * steps[0].inputs * size, s->inputs);
+    if (batch->codes.data)
+        gather(&batch->codes, L, first, columns, N * (long)sizeof(int64_t), s->codes);
+    else
+        for (long t = 0, row = 0; t < L; t++)
+            for (long at = (t * C + first) * N; at < (t * C + first + columns) * N; at++)
+                s->codes[row++] = at;
+    if (loss) {
+        gather(&loss->weights, L, first, columns, size, s->weights);
+        for (int i = 0; i < 2; i++)
+            if (loss->data[i].data)
+                gather(&loss->data[i], L, first, columns, loss->kind == POLICY ? N * size : size, s->of_loss[i]);
+        if (loss->actions.data)
+            gather(&loss->actions, L, first, columns, N * (long)sizeof(int64_t), s->actions);
+    }
     const float *x = s->inputs;
     for (long i = 0; i < count; i++) {
-        const Step *step = steps + i;
         Work *work = works + i;
         work->count = L * columns * work->rows;
-        if (step->kind == GRU) {
+        if (steps[i].kind == GRU) {
             const uint8_t *flags = batch->start.data;
             uint8_t *start = s->start;
             for (long t = 0; t < L; t++)
                 for (long column = first; column < first + columns; column++, start += work->rows)
                     memset(start, flags[t * batch->start.step + column * batch->start.column], (size_t)work->rows);
-            gru_forward(L, columns * work->rows, step, work, x, batch->initial + first * work->rows * step->outputs, s);
-        } else if (step->kind == FAN_OUT) {
-            if (batch->codes.data)
-                gather(&batch->codes, L, first, columns, N * (long)sizeof(int64_t), s->codes);
-            else
-                for (long t = 0, row = 0; t < L; t++)
-                    for (long at = (t * C + first) * N; at < (t * C + first + columns) * N; at++)
-                        s->codes[row++] = at;
-            fan_out_forward(step, work, N, batch->table, x, s);
+            gru_forward(L, columns * work->rows, steps + i, work, x,
+                        batch->initial + first * work->rows * steps[i].outputs, s);
         } else {
-            layer_forward(step, work, x);
+            rows_forward(steps + i, work, batch, x, s->codes);
         }
         x = work->y;
     }
 }
 
-static void loss_of_block(const Batch *batch, long first, long columns, const Loss *loss, const Work *last, long outputs,
-                          double *sums, Scratch *s) {
-    const long L = batch->length, N = batch->agents, size = (long)sizeof(float);
-    gather(&loss->weights, L, first, columns, size, s->weights);
-    for (int i = 0; i < 2; i++)
-        if (loss->data[i].data)
-            gather(&loss->data[i], L, first, columns, loss->kind == POLICY ? N * size : size, s->of_loss[i]);
-    if (loss->actions.data)
-        gather(&loss->actions, L, first, columns, N * (long)sizeof(int64_t), s->actions);
+/* The steps from `from` on, forward and with `loss` backward, for `size` of a block's steps of columns from number `at`
+ * on. */
+static void run_part(const Step *steps, long from, long count, const Batch *batch, const Loss *loss, long at, long size,
+                     const Work *works, float *grad_table, double *sums, const Scratch *of_block) {
+    const long N = batch->agents, last = count - 1, per_step = loss && loss->kind == POLICY ? N : 1;
+    Scratch s = *of_block;
+    Work own[MOST_STEPS];
+    memcpy(own, works, (size_t)count * sizeof(Work));
+    own[last].y += at * own[last].rows * steps[last].outputs;
+    s.codes += at * N;
+    const float *inputs = s.inputs + at * batch->rows * steps[0].inputs;
+    if (from)
+        inputs = works[from - 1].y + at * works[from - 1].rows * steps[from - 1].outputs;
+    for (long i = from; i < count; i++) {
+        own[i].count = size * own[i].rows;
+        rows_forward(steps + i, own + i, batch, i > from ? own[i - 1].y : inputs, s.codes);
+    }
+    if (!loss)
+        return;
+    float *below = from ? s.from_above + at * works[from - 1].rows * steps[from - 1].outputs : NULL;
+    float *grad = from < count ? s.from_part : below;
+    s.actions += at * N;
+    s.of_loss[0] += at * per_step;
+    s.of_loss[1] += at * per_step;
+    s.weights += at;
+    const long rows = size * own[last].rows, outputs = steps[last].outputs;
     if (loss->kind == POLICY)
-        policy_loss(last->count, N, outputs, loss, last->y, s->from_above, sums, s);
+        policy_loss(rows, N, outputs, loss, own[last].y, grad, sums, &s);
     else if (loss->kind == VALUE)
-        value_loss(last->count, loss, last->y, s->from_above, sums, s);
+        value_loss(rows, loss, own[last].y, grad, sums, &s);
     else
-        reward_loss(last->count, N, outputs, last->y, s->from_above, sums, s);
+        reward_loss(rows, N, outputs, own[last].y, grad, sums, &s);
+    for (long i = last; i >= from; i--) {
+        rows_backward(steps + i, own + i, batch, i > from ? own[i - 1].y : inputs, s.from_part, grad_table,
+                      i > from ? s.to_part : below, &s);
+        float *free = s.from_part;
+        s.from_part = s.to_part;
+        s.to_part = free;
+    }
 }
 
+/* The first `count` steps backward. */
 static void backward_block(const Step *steps, long count, const Batch *batch, long first, long columns, float *grad_table,
-                           const Work *works, Scratch *s) {
+                           const Work *works, const Scratch *of_block) {
+    Scratch s = *of_block;
     for (long i = count - 1; i >= 0; i--) {
-        const Step *step = steps + i;
         const Work *work = works + i;
-        const float *x = i ? works[i - 1].y : s->inputs;
-        float *to_below = i ? s->to_below : NULL;
-        if (step->kind == GRU)
-            gru_backward(batch->length, columns * work->rows, step, work, x,
-                         batch->initial + first * work->rows * step->outputs, s->from_above, to_below, s);
-        else if (step->kind == FAN_OUT)
-            fan_out_backward(step, work, batch->agents, s->from_above, grad_table, s->to_below, s);
+        const float *x = i ? works[i - 1].y : s.inputs;
+        float *to_below = i ? s.to_below : NULL;
+        if (steps[i].kind == GRU)
+            gru_backward(batch->length, columns * work->rows, steps + i, work, x,
+                         batch->initial + first * work->rows * steps[i].outputs, s.from_above, to_below, &s);
         else
-            layer_backward(step, work, x, s->from_above, to_below, s);
-        s->to_below = s->from_above;
-        s->from_above = to_below;
+            rows_backward(steps + i, work, batch, x, s.from_above, grad_table, to_below, &s);
+        s.to_below = s.from_above;
+        s.from_above = to_below;
     }
 }
 
@@ -1108,6 +1188,7 @@ static int run(const Step *steps, long count, void *packed, const Batch *batch, 
                float *states, float *grad_table, double *sums) {
     const long L = batch->length, C = batch->columns, size = (long)sizeof(float);
     const long block = max(1, min(C, BLOCK / rows_at_gru(steps, count, batch)));
+    const long in_parts = first_in_parts(steps, count), part = part_size(batch, L * block);
     const int learns = loss != NULL;
     Work works[MOST_STEPS] = {0};
     Arena arena = {0}, prepared = {packed, 0};
@@ -1123,18 +1204,16 @@ static int run(const Step *steps, long count, void *packed, const Batch *batch, 
         pack_weights(steps, count, learns, works);
     for (long first = 0; first < C; first += block) {
         const long columns = min(block, C - first);
-        forward_block(steps, count, batch, first, columns, works, &s);
-        const Work *last = works + count - 1;
-        if (loss) {
-            Scratch passing = s;
-            loss_of_block(batch, first, columns, loss, last, steps[count - 1].outputs, sums, &passing);
-            backward_block(steps, count, batch, first, columns, grad_table, works, &passing);
-        }
+        forward_block(steps, in_parts, batch, loss, first, columns, works, &s);
+        for (long at = 0; at < L * columns; at += part)
+            run_part(steps, in_parts, count, batch, loss, at, min(part, L * columns - at), works, grad_table, sums, &s);
+        if (loss)
+            backward_block(steps, in_parts, batch, first, columns, grad_table, works, &s);
         for (long i = 0; i < count; i++)
             if (steps[i].kind == GRU && states)
                 scatter(L, C, first, columns, works[i].rows * steps[i].outputs * size, works[i].y, states);
         if (outputs)
-            scatter(L, C, first, columns, last->rows * steps[count - 1].outputs * size, last->y, outputs);
+            scatter(L, C, first, columns, works[count - 1].rows * steps[count - 1].outputs * size, works[count - 1].y, outputs);
     }
     end_flush(mode);
     free(arena.base);
