@@ -75,11 +75,7 @@ class RewardNetworkSettings:
     replay_chunks: int = setting(64, 'chunks drawn for each of these steps', unit='chunks', minimum=1, maximum=1_000_000)
     path: str = setting('', 'file of train_reward with the reward networks to begin with; empty for untrained ones. A run '
                             'that is resumed no longer reads it')
-    freeze: bool = setting(False, 'keep the reward networks as they are in the file')
-
-    def __post_init__(self):
-        if self.freeze and not self.path:
-            raise SettingsError('reward_network.freeze keeps the networks of a file: name it in reward_network.path')
+    freeze: bool = setting(False, 'keep the reward networks as they are in the file that path names')
 
 
 @dataclass(frozen=True)

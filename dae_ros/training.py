@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,8 +63,8 @@ class Training:
         resumed = folder.newest_checkpoint()
         if resumed is not None:
             self._resume(*resumed)
-        elif settings.reward_network.path:
-            self._learner.begin_with(reward_files.read(Path(settings.reward_network.path), spec, settings.reward_network))
+        elif settings.reward_network.path or settings.reward_network.freeze:
+            self._learner.begin_with(reward_files.read(spec, settings.reward_network))
         self._log = MetricsLog(folder.path, None if resumed is None else self.environment_steps)
         self._began_at: float | None = None
         self._steps_at_start = self.environment_steps

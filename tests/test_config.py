@@ -51,15 +51,14 @@ def values_of(info: SettingInfo) -> SearchStrategy:
     return strategies.text()
 
 
-def consistent(values):
-    """The values with a number of worlds that can be split into the groups they say, and a file for networks to be kept."""
+def with_equal_groups(values):
+    """The values with a number of worlds that can be split into the groups they say."""
     groups, worlds = values.get('world_groups', 1), values.get('num_worlds', 128)
-    values = values | {'num_worlds': max(groups, worlds - worlds % groups)} if groups > 1 else values
-    return values | {'reward_network.path': 'some.safetensors'} if values.get('reward_network.freeze') else values
+    return values | {'num_worlds': max(groups, worlds - worlds % groups)} if groups > 1 else values
 
 
 SOME_VALUES = strategies.fixed_dictionaries({}, optional={
-    name: values_of(info) for name, info in SETTINGS.items()}).map(consistent)
+    name: values_of(info) for name, info in SETTINGS.items()}).map(with_equal_groups)
 
 
 def read_text(text: str | bytes) -> dict:
@@ -191,7 +190,7 @@ def test_settings_come_back_from_yaml_as_they_were(values):
 @by_name([info for info in SETTINGS.values() if info.kind is not str])
 def test_the_digest_tells_every_change_of_a_setting(info):
     changed = not info.default if info.kind is bool else info.maximum if info.default != info.maximum else info.minimum
-    base = config.from_flat({'num_worlds': SETTINGS['world_groups'].maximum, 'reward_network.path': 'some.safetensors'})
+    base = config.from_flat({'num_worlds': SETTINGS['world_groups'].maximum})
     assert config.digest(config.from_flat({info.name: changed}, base)) != config.digest(base)
     assert config.digest(config.from_flat({info.name: config.flatten(base)[info.name]}, base)) == config.digest(base)
 

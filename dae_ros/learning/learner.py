@@ -82,7 +82,7 @@ class Learner:
 
         Raises SettingsError if there is none to be replaced.
         """
-        if not isinstance(self._estimator, DifferenceEstimator) or not self._settings.beta:
+        if 'reward_network.0' not in self._networks():
             raise SettingsError('reward_network.path needs the reward network that estimator = dae has at beta above 0')
         self._estimator.begin_with([{f'parameters.{name}': torch.from_numpy(tensor) for name, tensor in parameters.items()}
                                     for parameters in reward_networks])

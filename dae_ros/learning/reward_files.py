@@ -21,8 +21,14 @@ def encode(networks: Iterable[RewardNetwork], spec: WorldSpec, settings: RewardN
     return encode_reward_network(tensors, _schema(spec, settings))
 
 
-def read(path: Path, spec: WorldSpec, settings: RewardNetworkSettings) -> list[dict[str, np.ndarray]]:
-    """Each network's parameters by name. SettingsError if the file cannot be read or its networks are of another kind."""
+def read(spec: WorldSpec, settings: RewardNetworkSettings) -> list[dict[str, np.ndarray]]:
+    """Each network's parameters by name, from the file that `settings` names.
+
+    SettingsError if they name none, if it cannot be read or if its networks are of another kind.
+    """
+    path = Path(settings.path)
+    if not settings.path:
+        raise SettingsError('reward_network.freeze keeps the networks of a file: name it in reward_network.path')
     try:
         tensors, found = decode_reward_network(path.read_bytes())
     except OSError as error:
