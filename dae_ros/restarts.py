@@ -55,6 +55,10 @@ class SignsOfLife:
         if name in self._heard:
             self._heard[name] = now
 
+    def forgive(self, now: float) -> None:
+        """Whoever listens was away until now: nobody could be heard."""
+        self._heard = dict.fromkeys(self._heard, now)
+
     def ended(self, name: str) -> None:
         """From here on nothing is expected of the node."""
         self._heard.pop(name, None)
@@ -64,8 +68,11 @@ class SignsOfLife:
         return [heard + self.limit for heard in self._heard.values()]
 
     def silent(self, now: float) -> list[str]:
-        """Who is silent now; named once."""
+        """Who is silent now; named once. Nobody where everybody is: then it is the listener who hears nothing."""
         silent = [name for name, heard in self._heard.items() if now - heard >= self.limit]
+        if len(silent) == len(self._heard):
+            self.forgive(now)
+            return []
         for name in silent:
             self.ended(name)
         return silent

@@ -40,6 +40,19 @@ def test_a_node_is_silent_that_was_started_and_not_heard_for_long():
     signs.heard('world', 105)
     assert signs.deadlines() == [115, 113] and signs.silent(112) == []
     assert signs.silent(113) == ['trainer'] and signs.silent(114) == []
-    signs.ended('world')
-    signs.heard('world', 114)
+    signs.forgive(150)
+    assert signs.deadlines() == [160]
+    signs.started('trainer', 155)
+    assert signs.silent(160) == ['world'] and signs.silent(164) == []
+    signs.ended('trainer')
+    signs.heard('world', 164)
     assert signs.silent(200) == signs.deadlines() == []
+
+
+def test_where_nobody_is_heard_it_is_the_listener_who_hears_nothing():
+    signs = SignsOfLife(10)
+    for name in ('world', 'trainer'):
+        signs.started(name, 0)
+    assert signs.silent(20) == [] and signs.deadlines() == [30, 30]
+    signs.heard('world', 25)
+    assert signs.silent(30) == ['trainer']

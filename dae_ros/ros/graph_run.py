@@ -27,6 +27,7 @@ from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 
 LOG_TAIL = 15  # lines of a dead node's log that are shown
+OVERSLEPT = 2.0  # s; later than this it was bringup itself that was stopped
 STATES = {getattr(TrainingStatus, name): name.lower() for name in
           ('WAITING', 'COLLECTING', 'LEARNING', 'PAUSED', 'EVALUATING', 'FINISHED', 'FAILED')}
 
@@ -72,9 +73,12 @@ class GraphRun:
             self._start_due()
             spinning.start()
             while not self._finished:
+                wake = self._next_moment()
                 try:
-                    event = self._events.get(timeout=self._until_next())
+                    event = self._events.get(timeout=None if wake is None else max(0.0, wake - time.monotonic()))
                 except queue.Empty:
+                    if time.monotonic() - wake > OVERSLEPT:
+                        self._signs.forgive(time.monotonic())
                     self._start_due()
                     self._kill_silent()
                 else:
@@ -89,10 +93,9 @@ class GraphRun:
         """`act` as a callback for other threads."""
         return lambda *arguments: self._events.put(partial(act, *arguments))
 
-    def _until_next(self) -> float | None:
-        """Seconds until a node is to be started or may count as silent."""
-        moments = [*self._due.values(), *self._signs.deadlines()]
-        return max(0.0, min(moments) - time.monotonic()) if moments else None
+    def _next_moment(self) -> float | None:
+        """When a node is to be started or may count as silent; s, monotonic."""
+        return min([*self._due.values(), *self._signs.deadlines()], default=None)
 
     def _start_due(self) -> None:
         for name in [name for name, at in self._due.items() if at <= time.monotonic()]:
@@ -121,6 +124,7 @@ class GraphRun:
     def _on_status(self, status: TrainingStatus) -> None:
         if status.run != self._folder.run:
             return
+        self._signs.heard('trainer', time.monotonic())
         if status.policy_version > self._newest:
             self._newest = status.policy_version
             self._restarts.got_on()

@@ -130,13 +130,13 @@ def test_the_server_serves_from_disk_before_a_trainer_is_back_that_lost_its_newe
 
 
 def test_a_node_that_is_alive_but_silent_is_replaced_and_named(disturb, undisturbed):
-    run, told = disturb(silence_timeout=15.0), []
+    run, told = disturb(silence_timeout=30.0), []
     with Listener() as listener:
         listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, lambda report: told.extend(report.status),
                                           qos.EVENTS)
         listener.wait_for_status(lambda status: status.policy_version >= 3)
         assert run.kill('agent_1', by=signal.SIGSTOP)
-        sentence = 'agent_1 has said nothing for 15 s and is killed'
+        sentence = 'agent_1 has said nothing for 30 s and is killed'
         listener.spin_until(lambda: any((status.name, status.message) == ('/agent_1', sentence) for status in told))
     assert sentence in run.assert_ends_with(undisturbed(UPDATES))
 
