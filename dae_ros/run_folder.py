@@ -71,7 +71,7 @@ class RunFolder:
         Raises RunFolderError if there is one. Removes what one that was killed left half written.
         """
         try:
-            lock = open(self.path / 'lock', 'wb')
+            lock = open(self.path / 'trainer.lock', 'wb')
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:

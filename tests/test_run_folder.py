@@ -229,7 +229,7 @@ def test_a_folder_belongs_to_one_trainer_at_a_time(tmp_path):
 
 def test_a_folder_that_can_only_be_read_is_an_error_that_names_it(tmp_path):
     folder = RunFolder(tmp_path, SETTINGS)
-    (tmp_path / 'lock').mkdir()  # nobody may write here, root included
+    (tmp_path / 'trainer.lock').mkdir()  # nobody may write here, root included
     with pytest.raises(RunFolderError, match=f'^cannot write the run folder {tmp_path}: '):
         folder.claim()
 
