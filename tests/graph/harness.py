@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Callable
 
@@ -83,8 +84,10 @@ class Graph:
 def bringup(folder: Path, values: dict, *arguments: str) -> subprocess.Popen:
     """The bringup command in a process of its own, as a user would type it."""
     settings = [text for name, value in values.items() for text in ('-p', f'{name}:={json.dumps(value)}')]
+    # Tests that were started in the background ignore SIGINT, and so would whatever they start.
     return subprocess.Popen([sys.executable, '-m', 'dae_ros_nodes.bringup', '--run-folder', str(folder), *settings, *arguments],
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                            preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL))
 
 
 def finish(process: subprocess.Popen) -> tuple[int, str, str]:
