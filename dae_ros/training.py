@@ -115,9 +115,8 @@ class Training:
         now = time.monotonic()
         self._began_at = self._began_at or now
         self._rollout_began_at = now
-        request = RolloutRequest(self.run, self._rollout, self.attempt, self.policy_version, self.settings.run.seed,
-                                 self.settings.run.num_steps, self.evaluating and self.settings.run.evaluation_greedy)
-        return request
+        return RolloutRequest(self.run, self._rollout, self.attempt, self.policy_version, self.settings.run.seed,
+                              self.settings.run.num_steps, self.evaluating and self.settings.run.evaluation_greedy)
 
     def consume(self, trajectory: Trajectory) -> None:
         """Learn from the rollout asked for last, or count it towards the evaluation."""

@@ -7,14 +7,13 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from datetime import datetime
 from pathlib import Path
 
 from dae_ros import torchrun
+from dae_ros.command import interrupt_on_sigterm, run_command
 from dae_ros.config import SETTINGS, Settings
-from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.report.summary import Summary
 from dae_ros.ros.graph import find_task_file, read_settings
@@ -63,39 +62,32 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
     GraphRun(settings, folder, namespace, display).run()
 
 
-def interrupt(number: int, frame) -> None:
-    """SIGTERM ends bringup the way Ctrl-C does."""
-    raise KeyboardInterrupt
+def bring_up(arguments: argparse.Namespace) -> int:
+    """The run that the arguments describe, or this process's part of its learning. The exit code."""
+    if torchrun.rank() > 0:
+        from dae_ros.learning.distributed import help_to_learn
+
+        help_to_learn()
+        return 0
+    task_file = find_task_file(arguments.task_file) if arguments.task_file else None
+    settings = read_settings(task_file, arguments.parameter)
+    stem = task_file.stem if task_file else settings.task.task.replace(':', '_')
+    path = arguments.run_folder or Path('runs') / f'{stem}-{datetime.now():%Y%m%d-%H%M%S}'
+    folder = RunFolder(path, settings)
+    with ProgressDisplay() as display:
+        display.note(f'training in {path} (logs of the nodes in {path / "logs"})')
+        if arguments.in_process:
+            train_in_process(settings, folder, display)
+        else:
+            train_on_graph(settings, folder, arguments.namespace, display)
+    print(Summary.read(folder.summary_file).lines())
+    return 0
 
 
 def main(args: list[str] | None = None) -> int:
     arguments = parse_arguments(args)
-    signal.signal(signal.SIGTERM, interrupt)
-    try:
-        if torchrun.rank() > 0:
-            from dae_ros.learning.distributed import help_to_learn
-
-            help_to_learn()
-            return 0
-        task_file = find_task_file(arguments.task_file) if arguments.task_file else None
-        settings = read_settings(task_file, arguments.parameter)
-        stem = task_file.stem if task_file else settings.task.task.replace(':', '_')
-        path = arguments.run_folder or Path('runs') / f'{stem}-{datetime.now():%Y%m%d-%H%M%S}'
-        folder = RunFolder(path, settings)
-        with ProgressDisplay() as display:
-            display.note(f'training in {path} (logs of the nodes in {path / "logs"})')
-            if arguments.in_process:
-                train_in_process(settings, folder, display)
-            else:
-                train_on_graph(settings, folder, arguments.namespace, display)
-        print(Summary.read(folder.summary_file).lines())
-        return 0
-    except KeyboardInterrupt:
-        print('stopped; every process is down', file=sys.stderr)
-        return 130
-    except DaeRosError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 2
+    interrupt_on_sigterm()
+    return run_command(lambda: bring_up(arguments), 'stopped; every process is down')
 
 
 if __name__ == '__main__':

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from dae_ros import config
+from dae_ros.command import run_command
 from dae_ros.config import SETTINGS, RewardTrainingSettings, declarations
 from dae_ros.errors import DaeRosError
 from dae_ros.files import write_atomically
@@ -96,16 +97,13 @@ def train(dataset: Dataset, arguments: argparse.Namespace, console: Console) -> 
 
 def main(args: list[str] | None = None) -> int:
     arguments = parse_arguments(args)
-    try:
+
+    def act() -> int:
         read_settings(arguments.parameter)
         train(Dataset(*arguments.bag), arguments, Console(highlight=False))
         return 0
-    except KeyboardInterrupt:
-        print('stopped; nothing was written', file=sys.stderr)
-        return 130
-    except DaeRosError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 2
+
+    return run_command(act, 'stopped; nothing was written')
 
 
 if __name__ == '__main__':

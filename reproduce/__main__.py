@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import signal
 import sys
 import time
 from pathlib import Path
@@ -21,7 +20,7 @@ from pathlib import Path
 import dae_ros_nodes  # noqa: F401  sets the threads of the numerical libraries, as for the nodes
 
 from benchmarks.machine import ROOT
-from dae_ros.errors import DaeRosError
+from dae_ros.command import interrupt_on_sigterm, run_command
 from reproduce import figures, schedule
 from reproduce.figures import Figure
 from reproduce.progress import Progress
@@ -92,27 +91,19 @@ def reproduce(chosen: list[Figure], workers: int, records: Records, docs: Path) 
     return len(failed)
 
 
-def interrupt(number: int, frame) -> None:
-    """SIGTERM ends it the way Ctrl-C does."""
-    raise KeyboardInterrupt
-
-
 def main(arguments: list[str] | None = None) -> int:
     options = parse_arguments(arguments)
-    signal.signal(signal.SIGTERM, interrupt)
+    interrupt_on_sigterm()
     records = Records(options.runs)
-    try:
+
+    def act() -> int:
         chosen = figures.load(options.figures, options.seeds, options.steps, options.short)
         if options.list:
             show(chosen, records)
             return 0
         return 1 if reproduce(chosen, options.workers, records, options.docs) else 0
-    except KeyboardInterrupt:
-        print('stopped; the same command goes on from here', file=sys.stderr)
-        return 130
-    except DaeRosError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 2
+
+    return run_command(act, 'stopped; the same command goes on from here')
 
 
 if __name__ == '__main__':

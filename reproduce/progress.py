@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Iterable
 from rich import progress
 from rich.console import Console
 
-from dae_ros.report.style import compact, signed
+from dae_ros.report.style import rounded, signed
 from reproduce.records import Records
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Progress:
         for job in running:
             steps, mean_return = records.progress(job.run.name)
             left += job.work(steps)
-            facts = f'{_rounded(steps)}/{_rounded(job.run.steps)} steps, {self._speed(job, now, steps):,.0f}/s'
+            facts = f'{rounded(steps)}/{rounded(job.run.steps)} steps, {self._speed(job, now, steps):,.0f}/s'
             if math.isfinite(mean_return):
                 facts += f', return {signed(mean_return)}'
             if job not in self._bar_of:
@@ -80,10 +80,6 @@ class Progress:
             del seen[0]
         (began, before), (ended, after) = seen[0], seen[-1]
         return max(0, after - before) / (ended - began) if ended > began else 0.0
-
-
-def _rounded(steps: int) -> str:
-    return compact(float(f'{steps:.3g}'))
 
 
 def _duration(seconds: float) -> str:

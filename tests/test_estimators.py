@@ -11,6 +11,7 @@ from dae_ros import config
 from dae_ros.config import RewardNetworkSettings
 from dae_ros.learning import advantages
 from dae_ros.learning.chunks import ActionChunks
+from dae_ros.learning.estimators import ensemble_prediction
 from dae_ros.learning.learner import Learner
 from dae_ros.learning.reward_replay import RewardReplay
 from dae_ros.rollout.in_process import train
@@ -213,7 +214,7 @@ def test_the_reward_network_says_what_it_expects_of_a_rollout_and_others_say_tha
     dae, trajectory = learner(LEARNER, REWARD), random_trajectory()
     expected = dae.expected_rewards(trajectory)
     data = dae._tensors(trajectory)
-    predicted = dae._estimator._predicted_rewards(data)[0].numpy()
+    predicted = ensemble_prediction(dae._estimator._reward, data)[0].numpy()
     np.testing.assert_allclose(expected, (predicted * trajectory.probabilities).sum(-1), rtol=1e-6)
     with pytest.raises(ValueError, match='at beta = 0 there is no reward network'):
         learner(replace(LEARNER, beta=0.0), REWARD).expected_rewards(trajectory)

@@ -7,7 +7,7 @@ of its networks on that rollout. The actor's training is the same whatever the e
 from __future__ import annotations
 
 from functools import partial
-from typing import Callable, Iterable, Mapping, NamedTuple
+from typing import Callable, Iterable, Mapping, NamedTuple, Sequence
 
 import numpy as np
 import torch
@@ -67,6 +67,13 @@ class ActionNetwork:
         return self._passes.train(self.name, self.adam, gradient, batches, network.num_agents, (loss_name,), shared)
 
 
+def ensemble_prediction(members: Sequence[ActionNetwork], data: Trajectory) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """The networks' mean prediction [T, W, N, A], what it is made from, and each member's recurrent states."""
+    inputs = members[0].inputs(data)
+    predictions = [member.predict(inputs, data) for member in members]
+    return torch.stack([predicted for predicted, _ in predictions]).mean(0), inputs, [states for _, states in predictions]
+
+
 class DifferenceEstimator:
     """DAE (section 3.3): GAE of a central critic, less what each agent's reward was to be expected without knowing its action.
 
@@ -105,7 +112,7 @@ class DifferenceEstimator:
             expected = torch.from_numpy(self._exact_rewards(Trajectory(*(part.cpu().numpy() for part in data)))).to(team)
         elif self._reward:
             remembered = as_remembered(data, self._reward_settings)
-            predicted, inputs, states = self._predicted_rewards(remembered)
+            predicted, inputs, states = ensemble_prediction(self._reward, remembered)
             expected = advantages.expected_rewards(predicted, data.probabilities)
             taken = advantages.of_actions(predicted, data.actions)
             error = (taken - data.rewards.unsqueeze(-1)).square().mean()
@@ -131,7 +138,7 @@ class DifferenceEstimator:
         """E over a_i ~ pi_i of the predicted reward, [T, W, N]. Raises ValueError at beta = 0, which has no reward network."""
         if not self._reward:
             raise ValueError('at beta = 0 there is no reward network')
-        predicted, _, _ = self._predicted_rewards(as_remembered(data, self._reward_settings))
+        predicted, _, _ = ensemble_prediction(self._reward, as_remembered(data, self._reward_settings))
         return advantages.expected_rewards(predicted, data.probabilities)
 
     def begin_with(self, reward_networks: list[dict[str, Tensor]]) -> None:
@@ -159,12 +166,6 @@ class DifferenceEstimator:
             ongoing = torch.zeros(1, len(data.final_states), dtype=torch.bool, device=outputs.device)
             final_values = critic(data.final_states[None, :, None], hidden[:-1][data.truncated], ongoing)[0].view(-1)
         return outputs.flatten(1), hidden, final_values
-
-    def _predicted_rewards(self, data: Trajectory) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """The ensemble's mean prediction [T, W, N, A], what it is made from, and each member's recurrent states."""
-        inputs = self._reward[0].inputs(data)
-        predictions = [member.predict(inputs, data) for member in self._reward]
-        return torch.stack([predicted for predicted, _ in predictions]).mean(0), inputs, [states for _, states in predictions]
 
     def _critic_training(self, chunks: ValueChunks, first: Tensor, rollout: int) -> Training:
         settings, network = self._settings, self._critic.network

@@ -18,9 +18,9 @@ from dae_ros import draws
 from dae_ros.config import RewardTrainingSettings, Settings
 from dae_ros.errors import BagError
 from dae_ros.learning import advantages, reward_files
-from dae_ros.learning.chunks import ActionChunks, first_states, to_chunks
+from dae_ros.learning.chunks import ActionChunks, chosen_chunks, first_states, to_chunks
 from dae_ros.learning.device import chosen_device
-from dae_ros.learning.estimators import ActionNetwork, action_chunks, as_remembered, chunk_length
+from dae_ros.learning.estimators import ActionNetwork, action_chunks, as_remembered, chunk_length, ensemble_prediction
 from dae_ros.learning.networks import make_reward_network
 from dae_ros.learning.passes import Passes
 from dae_ros.replay.dataset import Dataset
@@ -184,7 +184,7 @@ class RewardTraining:
             chunks = chunks._replace(weights=chunks.weights * to_chunks(learnt.float(), length))
             useful = (chunks.weights.sum(0) > 0).nonzero().flatten()
             firsts = [first_states(member.predict(inputs, data)[1], len(chunks.weights))[useful] for member in self._members]
-            pool.append((ActionChunks(*(part[:, useful] for part in chunks)), firsts))
+            pool.append((chosen_chunks(chunks, useful), firsts))
             size += len(useful)
         if pool:
             yield pool
@@ -204,9 +204,7 @@ class RewardTraining:
 
     def _predict(self, data: Trajectory) -> Tensor:
         """The ensemble's mean prediction [T, W, N, A]."""
-        data = as_remembered(data, self._reward)
-        inputs = self._members[0].inputs(data)
-        return torch.stack([member.predict(inputs, data)[0] for member in self._members]).mean(0)
+        return ensemble_prediction(self._members, as_remembered(data, self._reward))[0]
 
     def _of_worlds(self, trajectory: Trajectory, wanted: np.ndarray) -> tuple[Trajectory, Tensor]:
         """The rollout in the worlds in which any step is wanted, and `wanted` [T, W] there, as tensors."""

@@ -9,7 +9,7 @@ import time
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from dae_ros.report.style import compact, signed
+from dae_ros.report.style import rounded, signed
 
 LINE_PERIOD = 5.0  # s between two lines where there is no terminal
 
@@ -41,7 +41,7 @@ class ProgressDisplay:
         """Shows the run as it stands."""
         if state in ('collecting', 'learning'):
             state = 'training'  # they take turns several times a second
-        facts = f'{_rounded(environment_steps)}/{_rounded(total_steps)} steps'
+        facts = f'{rounded(environment_steps)}/{rounded(total_steps)} steps'
         if math.isfinite(mean_return):
             facts += f', return {signed(mean_return)}'
         if steps_per_second:
@@ -53,11 +53,6 @@ class ProgressDisplay:
             self._printed_at = now
             self.note(f'{state}: {facts}')
         self._state = state
-
-
-def _rounded(steps: int) -> str:
-    """Three digits are what fits into a terminal of 80 columns."""
-    return compact(float(f'{steps:.3g}'))
 
 
 def _duration(seconds: float) -> str:

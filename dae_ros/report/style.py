@@ -33,3 +33,8 @@ def compact(value: float, _position: int | None = None) -> str:
         if abs(value) >= unit:
             return f'{value / unit:g}{letter}'
     return f'{value:g}'
+
+
+def rounded(steps: int) -> str:
+    """A count for a line of progress: three digits are what fits into a terminal of 80 columns."""
+    return compact(float(f'{steps:.3g}'))

@@ -1,0 +1,32 @@
+"""How every command for people ends: with an exit code and, where something was wrong, with one sentence."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import Callable
+
+from dae_ros.errors import DaeRosError
+from dae_ros.restarts import EXIT_REFUSED
+
+EXIT_INTERRUPTED = 130  # as of a shell's command that was ended by Ctrl-C
+
+
+def run_command(act: Callable[[], int], stopped: str) -> int:
+    """The exit code that `act` gives; Ctrl-C ends it with the sentence `stopped`, a DaeRosError with what it says."""
+    try:
+        return act()
+    except KeyboardInterrupt:
+        print(stopped, file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except DaeRosError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return EXIT_REFUSED
+
+
+def interrupt_on_sigterm() -> None:
+    """SIGTERM ends this process the way Ctrl-C does."""
+    def interrupt(number: int, frame) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
