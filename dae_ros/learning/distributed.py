@@ -98,9 +98,10 @@ def help_to_learn() -> None:
             learner.load_state(_named(arrays, 'state.'))
             learner.update(Trajectory(**_named(arrays, 'trajectory.')), int(arrays['rollout']))
         learner.close()
-        team.leave()
     except RuntimeError as error:  # what torch raises when a connection breaks
         raise DaeRosError(f'lost the leading learner: {str(error).splitlines()[0]}') from error
+    finally:
+        team.leave()  # the connection's threads must end before the interpreter: met at its end, they abort the process
 
 
 def _named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
