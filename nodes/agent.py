@@ -1,6 +1,7 @@
-"""agent: acts for one robot with the policy the parameter server hands out.
+"""agent: acts for a robot with the policy the parameter server hands out, or for several robots, each by a node of its own.
 
     ros2 run dae_ros agent --ros-args -p robot:=0 -r __node:=agent_0
+    ros2 run dae_ros agent --ros-args -p robots:=3
 """
 
 from __future__ import annotations
@@ -10,21 +11,22 @@ import sys
 from dae_ros_msgs import msg, srv
 
 from dae_ros.config import SETTINGS, AgentSettings, GroupBinding, RunBinding, check_group, declarations
-from dae_ros.errors import Refused
+from dae_ros.errors import Refused, SettingsError
 from dae_ros.rollout.lockstep import AgentEnd, check_run
 from dae_ros.ros import convert, names, qos
-from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.node import TeamNode, run_together, settings_of_process
 from dae_ros.types import Action
 from dae_ros.weights.codec import open_weights
 
+DECLARED = [*declarations(AgentSettings, GroupBinding, RunBinding), SETTINGS['world_groups']]
 LISTENERS = 2  # the world and the trainer: an action must reach both
 
 
 class AgentNode(TeamNode):
     """Wires an `AgentEnd` to the topics of its group."""
 
-    def __init__(self):
-        super().__init__('agent', [*declarations(AgentSettings, GroupBinding, RunBinding), SETTINGS['world_groups']])
+    def __init__(self, name: str = 'agent', **given: int):
+        super().__init__(name, DECLARED, **given)
         robot, binding = self.settings['robot'], self.settings['run']
         self._group, self._world_groups = self.settings['group'], self.settings['world_groups']
         check_group(self._group, self._world_groups)
@@ -105,8 +107,21 @@ class AgentNode(TeamNode):
         return sentence, {'run': f'{self._end.run:x}', **group, 'robot': self._end.robot, 'policy version': version}
 
 
+def make_agents() -> list[AgentNode]:
+    """The agents that the command line asks for. Raises SettingsError."""
+    with settings_of_process('agent', DECLARED) as asked:
+        first, count, group, world_groups = (asked[name] for name in ('robot', 'robots', 'group', 'world_groups'))
+        if count == 1:
+            return [AgentNode()]
+        agents = [AgentNode(names.agent_node(robot, group, world_groups), robot=robot, robots=1)
+                  for robot in range(first, first + count)]
+    if len({agent.get_name() for agent in agents}) < count:
+        raise SettingsError(f'the agents of {count} robots cannot all be named {agents[0].get_name()}; leave __node to each')
+    return agents
+
+
 def main(args: list[str] | None = None) -> int:
-    return run(AgentNode, args)
+    return run_together(make_agents, args)
 
 
 if __name__ == '__main__':
