@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 
 from dae_ros_msgs import msg, srv
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from dae_ros.config import SETTINGS, AgentSettings, GroupBinding, RunBinding, check_group, declarations
 from dae_ros.errors import Refused, SettingsError
@@ -19,7 +20,7 @@ from dae_ros.types import Action
 from dae_ros.weights.codec import open_weights
 
 DECLARED = [*declarations(AgentSettings, GroupBinding, RunBinding), SETTINGS['world_groups']]
-LISTENERS = 2  # the world and the trainer: an action must reach both
+GUID_PREFIX = 12  # bytes of an endpoint's id that all endpoints of a process have in common
 
 
 class AgentNode(TeamNode):
@@ -40,13 +41,19 @@ class AgentNode(TeamNode):
         self._get_policy = self.create_client(srv.GetPolicy, names.GET_POLICY)
         self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED_INPUT, self._on_policy)
         self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
-        self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED_INPUT, self._on_request)
-        self.listen(msg.Observation, observation, qos.LATCHED_INPUT, self._on_observation)
+        self._heard = {'trainer': self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED_INPUT, self._on_request),
+                       'world': self.listen(msg.Observation, observation, qos.LATCHED_INPUT, self._on_observation)}
 
     def on_matched(self) -> None:
-        if self._unsent is not None and self._actions.get_subscription_count() >= LISTENERS:
+        if self._unsent is not None and not self._not_listening():
             unsent, self._unsent = self._unsent, None
             self._actions.publish(unsent)
+
+    def _not_listening(self) -> list[str]:
+        """To whom an action would be lost: world and trainer, known by what they say; anybody else may listen or not."""
+        listeners = processes(self.get_subscriptions_info_by_topic(self._actions.topic_name))
+        return [who for who, heard in self._heard.items()
+                if not listeners & processes(self.get_publishers_info_by_topic(heard.topic_name))]
 
     def _on_request(self, message: msg.RolloutRequest) -> None:
         try:
@@ -90,21 +97,26 @@ class AgentNode(TeamNode):
         if action is None:
             return
         message = convert.action_message(action)
-        if self._actions.get_subscription_count() >= LISTENERS:
-            self._actions.publish(message)
-        else:
+        if action.stamp.step == 0 and self._not_listening():
             self._unsent = message
+        else:
+            self._actions.publish(message)
 
     def diagnose(self):
         version = self._end.newest_version
         if version is None:
             sentence = 'waiting for a policy'
         elif self._unsent is not None:
-            sentence = 'waiting for the world and the trainer to listen'
+            sentence = f'waiting for {" and ".join(self._not_listening())} to listen'
         else:
             sentence = 'acting'
         group = {'group': self._group} if self._world_groups > 1 else {}
         return sentence, {'run': f'{self._end.run:x}', **group, 'robot': self._end.robot, 'policy version': version}
+
+
+def processes(endpoints: list[TopicEndpointInfo]) -> set[bytes]:
+    """The processes that some endpoints belong to."""
+    return {bytes(endpoint.endpoint_gid[:GUID_PREFIX]) for endpoint in endpoints}
 
 
 def make_agents() -> list[AgentNode]:
