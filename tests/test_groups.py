@@ -261,7 +261,8 @@ def processes(tmp_path, **task):
 
 
 def test_one_group_s_processes_are_named_as_ever_and_those_of_several_after_their_group(tmp_path):
-    assert list(processes(tmp_path / 'one', robots_per_process=1)) == ['world', 'agent_0', 'agent_1', 'parameter_server', 'trainer']
+    one = processes(tmp_path / 'one', robots_per_process=1)
+    assert list(one) == ['world', 'agent_0', 'agent_1', 'parameter_server', 'trainer']
     two = processes(tmp_path / 'two', robots_per_process=1, world_groups=2)
     assert list(two) == ['world_0', 'agent_0_0', 'agent_0_1', 'world_1', 'agent_1_0', 'agent_1_1', 'parameter_server', 'trainer']
     agent = two['agent_1_0']

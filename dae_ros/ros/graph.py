@@ -103,6 +103,8 @@ def read_settings(task_file: Path | None, overrides: Iterable[str]) -> Settings:
 
 def node_environment() -> dict[str, str]:
     """Environment variables for the nodes where the user has set none: this host only, and quick discovery."""
-    defaults = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-                'FASTRTPS_DEFAULT_PROFILES_FILE': str((shipped_config() / 'fastdds.xml').resolve())}
+    reach, profiles = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'
+    # SYSTEM_DEFAULT leaves it to the profile; LOCALHOST would overrule it and let only 32 processes find each other.
+    defaults = {reach: 'LOCALHOST' if profiles in os.environ else 'SYSTEM_DEFAULT',
+                profiles: str((shipped_config() / ('fastdds.xml' if reach in os.environ else 'fastdds_this_host.xml')).resolve())}
     return {name: os.environ.get(name, value) for name, value in defaults.items()}
