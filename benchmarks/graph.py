@@ -2,10 +2,11 @@
 
     python -m benchmarks.graph [--beta 0 0.95] [--robots 3] [--worlds 128] [--updates 30] [--rounds 3]
 
-Navigation, 25 steps a rollout, otherwise default settings. The graph with all agents in one process, the graph with a process
-for each, and the single process take turns, so that all meet the same disturbances; every number is the median of the rounds. Steps per second leave out the first updates, which warm up,
-and count everything else: collecting, learning, logs and checkpoints. A tick is one step of all worlds; its CPU
-milliseconds are those of the process's threads, DDS's among them, while a rollout is collected.
+Navigation, 25 steps a rollout, otherwise default settings. The graph with all agents in one process, the graph with a
+process for each, and the single process take turns, so that all meet the same disturbances; every number is the median
+of the rounds. Steps per second leave out the first updates, which warm up, and count everything else: collecting,
+learning, logs and checkpoints. A tick is one step of all worlds; its CPU milliseconds are those of the process's
+threads, DDS's among them, while a rollout is collected.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from dae_ros.config import Settings
 from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.restarts import Restarts, SignsOfLife, describe
-from dae_ros.ros import names, qos
+from dae_ros.ros import names, qos, shared_memory
 from dae_ros.ros.graph import node_environment, training_graph
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
@@ -62,6 +62,7 @@ class GraphRun:
                             for process in self._processes.values() for name in process.nodes}
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        began = time.time()
 
         def spin() -> None:
             try:
@@ -89,6 +90,7 @@ class GraphRun:
             rclpy.try_shutdown()
             if spinning.ident is not None:
                 spinning.join()
+            shared_memory.remove_left_behind(began)
 
     def _later(self, act: Callable[..., None]) -> Callable[..., None]:
         """`act` as a callback for other threads."""
