@@ -2,10 +2,11 @@
 
     python -m benchmarks.graph [--beta 0 0.95] [--robots 3] [--worlds 128] [--updates 30] [--rounds 3]
 
-Navigation, 25 steps a rollout, otherwise default settings. Graph and single process take turns, so that both meet the
-same disturbances; every number is the median of the rounds. Steps per second leave out the first updates, which warm up,
-and count everything else: collecting, learning, logs and checkpoints. A tick is one step of all worlds; its CPU
-milliseconds are those of the process's threads, DDS's among them, while a rollout is collected.
+Navigation, 25 steps a rollout, otherwise default settings. The graph with all agents in one process, the graph with a
+process for each, and the single process take turns, so that all meet the same disturbances; every number is the median
+of the rounds. Steps per second leave out the first updates, which warm up, and count everything else: collecting,
+learning, logs and checkpoints. A tick is one step of all worlds; its CPU milliseconds are those of the process's
+threads, DDS's among them, while a rollout is collected.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from dae_ros.run_folder import RunFolder
 
 WARM_UP = 3      # updates
 TIMEOUT = 600.0  # s without any news of the graph
+GRAPHS = {'graph': 0, 'agents_apart': 1}  # robots per process
 
 
 def cpu_seconds(process: int) -> float:
@@ -108,37 +110,52 @@ def medians(rounds: Sequence[dict[str, float]]) -> dict[str, float]:
 
 def measure(betas: Sequence[float] = (0.0, 0.95), robots: int = 3, worlds: int = 128, updates: int = 30,
             rounds: int = 3) -> dict:
-    """For each beta: `graph` and `single_process` (steps_per_second, collecting and learning in ms), their `ratio`,
-    `transport`, which is what collecting takes longer on the graph, and `cpu_ms_per_tick` by node."""
+    """For each beta: `single_process`, `graph` and `agents_apart` (steps_per_second, collecting and learning in ms), the graphs
+    with `ratio` over the single process and `ratios` of the turns, `transport`, which is what collecting takes longer than in
+    the single process, and `cpu_ms_per_tick` by process."""
     os.environ.update(node_environment())
     results = {}
     for beta in betas:
         settings = config.from_flat({'num_agents': robots, 'num_worlds': worlds, 'beta': beta, 'evaluation_episodes': 0,
                                      'total_steps': updates * worlds * config.RunSettings.num_steps})
-        graph, single, cpu = [], [], []
+        timings, cpu = {name: [] for name in (*GRAPHS, 'single_process')}, {name: [] for name in GRAPHS}
         with tempfile.TemporaryDirectory() as scratch:
             for turn in range(rounds):
-                cpu.append(run_graph(settings, Path(scratch, f'graph{turn}'), updates))
-                graph.append(timing(Path(scratch, f'graph{turn}')))
+                for name, together in GRAPHS.items():
+                    path = Path(scratch, f'{name}{turn}')
+                    cpu[name].append(run_graph(config.from_flat({'robots_per_process': together}, settings), path, updates))
+                    timings[name].append(timing(path))
                 run_single_process(settings, Path(scratch, f'single{turn}'))
-                single.append(timing(Path(scratch, f'single{turn}', 'run')))
-        ratios = [one['steps_per_second'] / other['steps_per_second'] for one, other in zip(graph, single)]
-        transport = [one['collecting'] - other['collecting'] for one, other in zip(graph, single)]
-        results[f'{beta:g}'] = {'ratio': statistics.median(ratios), 'ratios': ratios, 'graph': medians(graph),
-                                'single_process': medians(single), 'transport': statistics.median(transport),
-                                'cpu_ms_per_tick': {name: 1e3 * seconds for name, seconds in medians(cpu).items()}}
+                timings['single_process'].append(timing(Path(scratch, f'single{turn}', 'run')))
+        single = timings['single_process']
+        results[f'{beta:g}'] = {'single_process': medians(single),
+                                **{name: beside(timings[name], single) | {'cpu_ms_per_tick': milliseconds(cpu[name])}
+                                   for name in GRAPHS}}
     return results
+
+
+def beside(graph: Sequence[dict[str, float]], single: Sequence[dict[str, float]]) -> dict:
+    """What `measure` says of a graph, from the turns of both."""
+    ratios = [one['steps_per_second'] / other['steps_per_second'] for one, other in zip(graph, single)]
+    transport = [one['collecting'] - other['collecting'] for one, other in zip(graph, single)]
+    return {**medians(graph), 'ratio': statistics.median(ratios), 'ratios': ratios, 'transport': statistics.median(transport)}
+
+
+def milliseconds(rounds: Sequence[dict[str, float]]) -> dict[str, float]:
+    return {name: 1e3 * seconds for name, seconds in medians(rounds).items()}
 
 
 def as_text(beta: str, found: dict) -> str:
     """What `measure` found for one beta, for people."""
-    lines = [f'beta {beta}: the graph at {found["ratio"]:.3f} of the single process '
-             f'({", ".join(f"{ratio:.3f}" for ratio in found["ratios"])}), transport {found["transport"]:.0f} ms']
-    for name in ('graph', 'single_process'):
-        one = found[name]
+    lines = [f'beta {beta}']
+    for name, one in found.items():
         lines.append(f'  {name.replace("_", " "):16}{one["steps_per_second"]:8.0f} steps/s'
                      f'   collecting {one["collecting"]:6.1f} ms   learning {one["learning"]:7.1f} ms')
-    lines.append('  CPU per tick    ' + '   '.join(f'{name} {ms:.2f} ms' for name, ms in found['cpu_ms_per_tick'].items()))
+    for name in GRAPHS:
+        one = found[name]
+        lines.append(f'  {name.replace("_", " ")} at {one["ratio"]:.3f} of the single process '
+                     f'({", ".join(f"{ratio:.3f}" for ratio in one["ratios"])}), transport {one["transport"]:.0f} ms')
+        lines.append('    CPU per tick  ' + '   '.join(f'{node} {ms:.2f} ms' for node, ms in one['cpu_ms_per_tick'].items()))
     return '\n'.join(lines)
 
 

@@ -132,6 +132,8 @@ class RunSettings:
                                 minimum=0, maximum=1_000_000)
     max_silent_attempts: int = setting(20, 'attempts in a row at a rollout that fell silent before its end, after which the '
                                            'trainer gives up', minimum=1, maximum=1_000_000)
+    robots_per_process: int = setting(0, 'robots of a group whose agents share a process of bringup\'s or ros2 launch\'s; 0 for '
+                                         'all. The weights do not depend on it', unit='robots', minimum=0, maximum=1000)
     silence_timeout: float = setting(300.0, 'a node that has given no sign of life for this long, longer than any update takes, '
                                             'is replaced by bringup', unit='s', minimum=1.0, maximum=86_400.0)
     keep_every: int = setting(1000, 'checkpoints of every so many updates are kept for good; 0 for none', unit='updates',
@@ -167,6 +169,9 @@ class AgentSettings:
     """What is particular to one agent."""
 
     robot: int = setting(0, 'index of the robot this agent acts for, from 0', minimum=0, maximum=65535)
+    robots: int = setting(1, 'robots this process acts for, from that one on; if several, each by a node of its own, named '
+                             'agent_<robot>, or agent_<group>_<robot> where there are groups', unit='robots', minimum=1,
+                          maximum=1000)
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,8 @@ def start(context) -> list:
 
     environment = [SetEnvironmentVariable(name, value) for name, value in node_environment().items()]
     return environment + [
-        Node(package='dae_ros', executable=process.executable, name=process.name, namespace=argument['namespace'],
+        Node(package='dae_ros', executable=process.executable, namespace=argument['namespace'],
+             name=None if process.several else process.name,
              parameters=[str(folder.settings_file), {name: value for name, value in process.parameters.items()}],
              output='screen', respawn=True, respawn_delay=RESPAWN_DELAY, on_exit=end_all(process.name))
         for process in training_graph(settings, folder)]

@@ -1,6 +1,7 @@
-"""agent: acts for one robot with the policy the parameter server hands out.
+"""agent: acts for a robot with the policy the parameter server hands out, or for several robots, each by a node of its own.
 
     ros2 run dae_ros agent --ros-args -p robot:=0 -r __node:=agent_0
+    ros2 run dae_ros agent --ros-args -p robots:=3
 """
 
 from __future__ import annotations
@@ -8,23 +9,25 @@ from __future__ import annotations
 import sys
 
 from dae_ros_msgs import msg, srv
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from dae_ros.config import SETTINGS, AgentSettings, GroupBinding, RunBinding, check_group, declarations
-from dae_ros.errors import Refused
+from dae_ros.errors import Refused, SettingsError
 from dae_ros.rollout.lockstep import AgentEnd, check_run
 from dae_ros.ros import convert, names, qos
-from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.node import TeamNode, run_together, settings_of_process
 from dae_ros.types import Action
 from dae_ros.weights.codec import open_weights
 
-LISTENERS = 2  # the world and the trainer: an action must reach both
+DECLARED = [*declarations(AgentSettings, GroupBinding, RunBinding), SETTINGS['world_groups']]
+GUID_PREFIX = 12  # bytes of an endpoint's id that all endpoints of a process have in common
 
 
 class AgentNode(TeamNode):
     """Wires an `AgentEnd` to the topics of its group."""
 
-    def __init__(self):
-        super().__init__('agent', [*declarations(AgentSettings, GroupBinding, RunBinding), SETTINGS['world_groups']])
+    def __init__(self, name: str = 'agent', **given: int):
+        super().__init__(name, DECLARED, **given)
         robot, binding = self.settings['robot'], self.settings['run']
         self._group, self._world_groups = self.settings['group'], self.settings['world_groups']
         check_group(self._group, self._world_groups)
@@ -38,13 +41,19 @@ class AgentNode(TeamNode):
         self._get_policy = self.create_client(srv.GetPolicy, names.GET_POLICY)
         self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED_INPUT, self._on_policy)
         self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
-        self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED_INPUT, self._on_request)
-        self.listen(msg.Observation, observation, qos.LATCHED_INPUT, self._on_observation)
+        self._heard = {'trainer': self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED_INPUT, self._on_request),
+                       'world': self.listen(msg.Observation, observation, qos.LATCHED_INPUT, self._on_observation)}
 
     def on_matched(self) -> None:
-        if self._unsent is not None and self._actions.get_subscription_count() >= LISTENERS:
+        if self._unsent is not None and not self._not_listening():
             unsent, self._unsent = self._unsent, None
             self._actions.publish(unsent)
+
+    def _not_listening(self) -> list[str]:
+        """To whom an action would be lost: world and trainer, known by what they say; anybody else may listen or not."""
+        listeners = processes(self.get_subscriptions_info_by_topic(self._actions.topic_name))
+        return [who for who, heard in self._heard.items()
+                if not listeners & processes(self.get_publishers_info_by_topic(heard.topic_name))]
 
     def _on_request(self, message: msg.RolloutRequest) -> None:
         try:
@@ -88,25 +97,43 @@ class AgentNode(TeamNode):
         if action is None:
             return
         message = convert.action_message(action)
-        if self._actions.get_subscription_count() >= LISTENERS:
-            self._actions.publish(message)
-        else:
+        if action.stamp.step == 0 and self._not_listening():
             self._unsent = message
+        else:
+            self._actions.publish(message)
 
     def diagnose(self):
         version = self._end.newest_version
         if version is None:
             sentence = 'waiting for a policy'
         elif self._unsent is not None:
-            sentence = 'waiting for the world and the trainer to listen'
+            sentence = f'waiting for {" and ".join(self._not_listening())} to listen'
         else:
             sentence = 'acting'
         group = {'group': self._group} if self._world_groups > 1 else {}
         return sentence, {'run': f'{self._end.run:x}', **group, 'robot': self._end.robot, 'policy version': version}
 
 
+def processes(endpoints: list[TopicEndpointInfo]) -> set[bytes]:
+    """The processes that some endpoints belong to."""
+    return {bytes(endpoint.endpoint_gid[:GUID_PREFIX]) for endpoint in endpoints}
+
+
+def make_agents() -> list[AgentNode]:
+    """The agents that the command line asks for. Raises SettingsError."""
+    with settings_of_process('agent', DECLARED) as asked:
+        first, count, group, world_groups = (asked[name] for name in ('robot', 'robots', 'group', 'world_groups'))
+        if count == 1:
+            return [AgentNode()]
+        agents = [AgentNode(names.agent_node(robot, group, world_groups), robot=robot, robots=1)
+                  for robot in range(first, first + count)]
+    if len({agent.get_name() for agent in agents}) < count:
+        raise SettingsError(f'the agents of {count} robots cannot all be named {agents[0].get_name()}; leave __node to each')
+    return agents
+
+
 def main(args: list[str] | None = None) -> int:
-    return run(AgentNode, args)
+    return run_together(make_agents, args)
 
 
 if __name__ == '__main__':

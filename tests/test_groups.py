@@ -261,9 +261,27 @@ def processes(tmp_path, **task):
 
 
 def test_one_group_s_processes_are_named_as_ever_and_those_of_several_after_their_group(tmp_path):
-    assert list(processes(tmp_path / 'one')) == ['world', 'agent_0', 'agent_1', 'parameter_server', 'trainer']
-    two = processes(tmp_path / 'two', world_groups=2)
+    one = processes(tmp_path / 'one', robots_per_process=1)
+    assert list(one) == ['world', 'agent_0', 'agent_1', 'parameter_server', 'trainer']
+    two = processes(tmp_path / 'two', robots_per_process=1, world_groups=2)
     assert list(two) == ['world_0', 'agent_0_0', 'agent_0_1', 'world_1', 'agent_1_0', 'agent_1_1', 'parameter_server', 'trainer']
     agent = two['agent_1_0']
     assert (agent.executable, agent.parameters['group'], agent.parameters['robot']) == ('agent', 1, 0)
     assert (two['world_1'].executable, two['world_1'].parameters['group']) == ('world', 1)
+
+
+@pytest.mark.parametrize('together, expected', [
+    (0, {'agents_0-4': (0, 5)}), (1000, {'agents_0-4': (0, 5)}), (3, {'agents_0-2': (0, 3), 'agents_3-4': (3, 2)}),
+    (2, {'agents_0-1': (0, 2), 'agents_2-3': (2, 2), 'agent_4': (4, None)})])
+def test_robots_share_processes_as_many_as_are_asked_for_each_with_a_node_of_its_own(together, expected, tmp_path):
+    found = processes(tmp_path / 'run', num_agents=5, robots_per_process=together)
+    assert list(found) == ['world', *expected, 'parameter_server', 'trainer']
+    agents = [found[name] for name in expected]
+    assert [node for process in agents for node in process.nodes] == [f'agent_{robot}' for robot in range(5)]
+    assert [(process.parameters['robot'], process.parameters.get('robots')) for process in agents] == list(expected.values())
+
+
+def test_nodes_of_a_process_of_several_groups_bear_their_group(tmp_path):
+    agents = processes(tmp_path / 'run', world_groups=2)['agents_1_0-1']
+    assert agents.nodes == ('agent_1_0', 'agent_1_1')
+    assert (agents.parameters['group'], agents.parameters['robot'], agents.parameters['robots']) == (1, 0, 2)

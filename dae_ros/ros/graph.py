@@ -9,20 +9,29 @@ from typing import Iterable, NamedTuple
 from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.errors import SettingsError
+from dae_ros.ros import names
 from dae_ros.run_folder import RunFolder
 from dae_ros.worlds import world_spec
 
 
 class NodeProcess(NamedTuple):
-    """One node in a process of its own."""
+    """A process with one node of the same name, or with several."""
 
     executable: str
     name: str
     parameters: dict[str, int | str]  # beside those of the run's settings file
+    several: tuple[str, ...] = ()     # names of its nodes, which they give themselves; none where it is one node
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of its nodes."""
+        return self.several or (self.name,)
 
     def arguments(self, settings_file: Path, namespace: str) -> list[str]:
         """What follows the executable on its command line."""
-        arguments = ['--ros-args', '--params-file', str(settings_file), '-r', f'__node:={self.name}']
+        arguments = ['--ros-args', '--params-file', str(settings_file)]
+        if not self.several:
+            arguments += ['-r', f'__node:={self.name}']
         if namespace:
             arguments += ['-r', f'__ns:=/{namespace.strip("/")}']
         for name, value in self.parameters.items():
@@ -31,7 +40,7 @@ class NodeProcess(NamedTuple):
 
 
 def training_graph(settings: Settings, folder: RunFolder) -> list[NodeProcess]:
-    """Parameter server, trainer and, for each group, a world and one agent per robot: the processes of one run."""
+    """Parameter server, trainer and, for each group, a world and its robots' agents: the processes of one run."""
     run = {'run': folder.run}
     return [
         *(process for group in range(settings.task.world_groups) for process in _group(settings, group, run)),
@@ -43,10 +52,21 @@ def training_graph(settings: Settings, folder: RunFolder) -> list[NodeProcess]:
 
 def _group(settings: Settings, group: int, run: dict[str, int]) -> list[NodeProcess]:
     """World and agents of one group, numbered where there are several."""
-    mark = f'_{group}' if settings.task.world_groups > 1 else ''
-    agents = [NodeProcess('agent', f'agent{mark}_{robot}', {'group': group, 'robot': robot, **run})
-              for robot in range(settings.task.num_agents)]
-    return [NodeProcess('world', f'world{mark}', {'group': group, **run}), *agents]
+    task = settings.task
+    mark = f'_{group}' if task.world_groups > 1 else ''
+    together = settings.run.robots_per_process or task.num_agents
+    teams = [range(first, min(first + together, task.num_agents)) for first in range(0, task.num_agents, together)]
+    return [NodeProcess('world', f'world{mark}', {'group': group, **run}),
+            *(_agents(robots, group, task.world_groups, mark, run) for robots in teams)]
+
+
+def _agents(robots: range, group: int, world_groups: int, mark: str, run: dict[str, int]) -> NodeProcess:
+    """The agents of some robots of a group."""
+    nodes = tuple(names.agent_node(robot, group, world_groups) for robot in robots)
+    parameters = {'group': group, 'robot': robots[0], **run}
+    if len(robots) == 1:
+        return NodeProcess('agent', nodes[0], parameters)
+    return NodeProcess('agent', f'agents{mark}_{robots[0]}-{robots[-1]}', {**parameters, 'robots': len(robots)}, nodes)
 
 
 def find_task_file(name: str) -> Path:
@@ -83,6 +103,8 @@ def read_settings(task_file: Path | None, overrides: Iterable[str]) -> Settings:
 
 def node_environment() -> dict[str, str]:
     """Environment variables for the nodes where the user has set none: this host only, and quick discovery."""
-    defaults = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-                'FASTRTPS_DEFAULT_PROFILES_FILE': str((shipped_config() / 'fastdds.xml').resolve())}
+    reach, profiles = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'
+    # SYSTEM_DEFAULT leaves it to the profile; LOCALHOST would overrule it and let only 32 processes find each other.
+    defaults = {reach: 'LOCALHOST' if profiles in os.environ else 'SYSTEM_DEFAULT',
+                profiles: str((shipped_config() / ('fastdds.xml' if reach in os.environ else 'fastdds_this_host.xml')).resolve())}
     return {name: os.environ.get(name, value) for name, value in defaults.items()}

@@ -21,7 +21,7 @@ from dae_ros.config import Settings
 from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.restarts import Restarts, SignsOfLife, describe
-from dae_ros.ros import names, qos
+from dae_ros.ros import names, qos, shared_memory
 from dae_ros.ros.graph import node_environment, training_graph
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
@@ -58,9 +58,11 @@ class GraphRun:
         node.create_subscription(TrainingStatus, names.TRAINING_STATUS, self._later(self._on_status), qos.LATCHED_INPUT)
         node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._later(self._on_diagnostics), qos.EVENTS)
         self._diagnostics = node.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.EVENTS)
-        self._names = {f'{node.get_namespace().rstrip("/")}/{name}': name for name in self._processes}
+        self._process_of = {f'{node.get_namespace().rstrip("/")}/{name}': process.name
+                            for process in self._processes.values() for name in process.nodes}
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        began = time.time()
 
         def spin() -> None:
             try:
@@ -88,6 +90,7 @@ class GraphRun:
             rclpy.try_shutdown()
             if spinning.ident is not None:
                 spinning.join()
+            shared_memory.remove_left_behind(began)
 
     def _later(self, act: Callable[..., None]) -> Callable[..., None]:
         """`act` as a callback for other threads."""
@@ -111,15 +114,15 @@ class GraphRun:
         for name in self._signs.silent(time.monotonic()):
             sentence = f'{name} has said nothing for {self._signs.limit:g} s and is killed'
             self._display.note(sentence)
-            team_name = next(full for full, short in self._names.items() if short == name)
-            self._diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(level=DiagnosticStatus.STALE, name=team_name,
-                                                                               message=sentence)]))
+            nodes = [node for node, process in self._process_of.items() if process == name]
+            self._diagnostics.publish(DiagnosticArray(status=[
+                DiagnosticStatus(level=DiagnosticStatus.STALE, name=node, message=sentence) for node in nodes]))
             self._supervisor.kill(name)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name in self._names and status.level != DiagnosticStatus.STALE:
-                self._signs.heard(self._names[status.name], time.monotonic())
+            if status.name in self._process_of and status.level != DiagnosticStatus.STALE:
+                self._signs.heard(self._process_of[status.name], time.monotonic())
 
     def _on_status(self, status: TrainingStatus) -> None:
         if status.run != self._folder.run:

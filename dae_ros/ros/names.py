@@ -21,3 +21,8 @@ DIAGNOSTICS = '/diagnostics'
 def in_group(topic: str, group: int, world_groups: int) -> str:
     """The topic of one group of worlds; a group that is the only one needs no name."""
     return topic if world_groups == 1 else f'group_{group}/{topic}'
+
+
+def agent_node(robot: int, group: int, world_groups: int) -> str:
+    """The name of a robot's agent among the nodes of a team."""
+    return f'agent_{robot}' if world_groups == 1 else f'agent_{group}_{robot}'

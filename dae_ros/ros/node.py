@@ -6,13 +6,15 @@ import gc
 import signal
 import sys
 from collections import Counter
-from typing import Any, Callable, Iterable
+from contextlib import contextmanager
+from typing import Any, Callable, Iterable, Iterator
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
@@ -39,8 +41,10 @@ class TeamNode(Node):
     whenever an endpoint of theirs found or lost a partner, `on_new_source` and `diagnose`.
     """
 
-    def __init__(self, name: str, declared: Iterable[SettingInfo]):
-        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+    def __init__(self, name: str, declared: Iterable[SettingInfo], **given: Any):
+        """`given` are settings that hold whatever the command line says."""
+        super().__init__(name, automatically_declare_parameters_from_overrides=True,
+                         parameter_overrides=[Parameter(key, value=value) for key, value in given.items()])
         self.settings: dict[str, Any] = params.declare(self, declared)
         self.done = False
         self.busy = False  # whether a callback is at work
@@ -119,33 +123,56 @@ class TeamNode(Node):
         """Releases what the node holds beyond ROS; called once, also after an error."""
 
 
+@contextmanager
+def settings_of_process(name: str, declared: Iterable[SettingInfo]) -> Iterator[dict[str, Any]]:
+    """What the command line says before the nodes are made whose number and names depend on it. Raises SettingsError.
+
+    Only a node can read it; this one must not go before others are there, since the process's DDS goes with its last node.
+    """
+    reader = Node(name, enable_rosout=False, start_parameter_services=False, automatically_declare_parameters_from_overrides=True)
+    try:
+        yield params.declare(reader, declared)
+    finally:
+        reader.destroy_node()
+
+
 def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int:
     """Runs a node until it is done, interrupted or shut down; the exit code.
 
     0: done or asked to stop. 2: a setting or the surroundings are wrong, told in one sentence. A bug shows its traceback.
     """
-    node = executor = None
+    return run_together(lambda: [make_node()], args)
+
+
+def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | None = None) -> int:
+    """Runs the nodes of one process side by side, until one is done; otherwise as `run`."""
+    nodes: list[TeamNode] = []
+    executor = None
 
     def interrupt(number, frame) -> None:
         """Ctrl-C breaks into our own callbacks, not into the executor's work; that stops by itself, as on SIGTERM."""
-        if node is None or node.busy:
+        if not nodes or any(node.busy for node in nodes):
             raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, interrupt)  # rclpy's handler, which shuts the context down, calls this one
     rclpy.init(args=args)
     try:
         try:
-            node = make_node()
+            nodes += make_nodes()
             executor = Executor()
-            executor.add_node(node)
-            # What start-up made lives as long as the node. Unfrozen, the garbage collector goes through all of it again and
+            for node in nodes:
+                executor.add_node(node)
+            # What start-up made lives as long as the nodes. Unfrozen, the garbage collector goes through all of it again and
             # again, a quarter of an agent's time, since every message makes a few objects.
             gc.collect()
             gc.freeze()
-            while not node.done and node.context.ok():
+            while rclpy.ok():
                 executor.spin_once(LONG)
-                if node.failure is not None:
-                    raise node.failure
+                for node in nodes:
+                    if node.failure is not None:
+                        raise node.failure
+                    if node.done:
+                        return 0
             return 0
         except RuntimeError:
             # What rclpy raises when a callback still publishes after a signal has shut the context down.
@@ -158,7 +185,7 @@ def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int
                 signal.signal(number, signal.SIG_IGN)
             if executor is not None:
                 executor.shutdown()
-            if node is not None:
+            for node in nodes:
                 try:
                     node.close()
                 finally:

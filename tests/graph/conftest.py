@@ -20,8 +20,8 @@ def domain(monkeypatch):
     """A DDS domain nobody else on this host uses; also for nodes made in the test process."""
     with domain_id() as number:
         monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
-        monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(REPOSITORY / 'config' / 'fastdds.xml'))
+        monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SYSTEM_DEFAULT')
+        monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(REPOSITORY / 'config' / 'fastdds_this_host.xml'))
         yield number
 
 

@@ -120,15 +120,14 @@ def processes_naming(text: str) -> list[str]:
     return lines
 
 
-def pid_of(node: str, folder: Path) -> int | None:
-    """The process of a node of the run that lies below `folder`; None where it is not running."""
+def pid_of(name: str, folder: Path) -> int | None:
+    """The process of that name of the run that lies in `folder`, by where its output goes; None where it is not running."""
     for entry in Path('/proc').iterdir():
         try:
-            arguments = (entry / 'cmdline').read_bytes().decode(errors='replace').split('\0')
+            if os.readlink(entry / 'fd' / '1') == str(folder / 'logs' / f'{name}.log'):
+                return int(entry.name)
         except (OSError, NotADirectoryError):
             continue
-        if f'__node:={node}' in arguments and any(str(folder) in argument for argument in arguments):
-            return int(entry.name)
     return None
 
 

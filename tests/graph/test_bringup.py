@@ -29,9 +29,9 @@ def long_run(request, domain, tmp_path):
 
 
 @pytest.mark.parametrize('long_run', [{'max_restarts': 0}], indirect=True)
-@pytest.mark.parametrize('node', ['world', 'agent_1', 'parameter_server', 'trainer'])
+@pytest.mark.parametrize('node', ['world', 'agents_0-2', 'parameter_server', 'trainer'])
 def test_a_node_that_dies_too_often_ends_the_run_with_its_name_and_no_process_left(node, long_run, tmp_path):
-    pid = pid_of(node, tmp_path)
+    pid = pid_of(node, tmp_path / 'run')
     os.kill(pid, signal.SIGKILL)
     code, _, errors = finish(long_run)
     assert code == 2
@@ -43,7 +43,7 @@ def test_a_node_that_dies_too_often_ends_the_run_with_its_name_and_no_process_le
 @pytest.mark.parametrize('long_run', [{'max_restarts': 2}], indirect=True)
 def test_a_node_that_is_started_again_and_refuses_to_run_ends_the_run_with_what_it_said(long_run, tmp_path):
     (tmp_path / 'run' / 'attempts').write_text('damaged')
-    os.kill(pid_of('trainer', tmp_path), signal.SIGKILL)
+    os.kill(pid_of('trainer', tmp_path / 'run'), signal.SIGKILL)
     code, output, errors = finish(long_run)
     assert code == 2
     assert 'trainer was killed by SIGKILL and is started again' in output
@@ -60,7 +60,7 @@ def test_an_interrupted_run_stops_every_process(number, long_run, tmp_path):
     assert 'Traceback' not in output + errors
     assert not processes_naming(str(tmp_path))
     logs = [path.read_text() for path in (tmp_path / 'run' / 'logs').iterdir()]
-    assert len(logs) == 6 and not any('Traceback' in log for log in logs), logs
+    assert len(logs) == 4 and not any('Traceback' in log for log in logs), logs
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint_to_the_same_weights(domain, tmp_path):
@@ -80,7 +80,7 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint_to_the_same_weights(doma
 
 
 def test_nodes_end_when_bringup_itself_is_killed(long_run, tmp_path):
-    pids = [pid_of(node, tmp_path) for node in ('world', 'agent_0', 'agent_1', 'agent_2', 'parameter_server', 'trainer')]
+    pids = [pid_of(node, tmp_path / 'run') for node in ('world', 'agents_0-2', 'parameter_server', 'trainer')]
     long_run.kill()
     long_run.wait(TIMEOUT)
     for pid in pids:

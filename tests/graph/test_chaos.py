@@ -1,6 +1,6 @@
 """Whatever is killed, whenever: the run ends with the weights of the run that nothing disturbed, bit for bit.
 
-`make chaos` kills more often: CHAOS_KILLS says how often, CHAOS_SEED whom and when.
+`make chaos` kills more often: CHAOS_KILLS says how often, CHAOS_SEED in which arrangement, whom and when.
 """
 
 from __future__ import annotations
@@ -15,17 +15,19 @@ from dae_ros_msgs.msg import PolicyWeights, TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from harness import SMALL, Listener, bringup, finish, oracle, pid_of, processes_naming
 
+from dae_ros import config
 from dae_ros.report.metrics import read_metrics
 from dae_ros.report.summary import Summary
 from dae_ros.ros import names, qos
+from dae_ros.ros.graph import training_graph
+from dae_ros.run_folder import RunFolder
 from dae_ros.weights.codec import decode_policy
 
-AGENTS = ('agent_0', 'agent_1', 'agent_2')
-NODES = ('world', *AGENTS, 'parameter_server', 'trainer')
 UPDATES = 40
 VALUES = {**SMALL, 'total_steps': UPDATES * 8 * 25}
 KILLS = int(os.environ.get('CHAOS_KILLS', 5))
 SEED = int(os.environ.get('CHAOS_SEED', 1))
+ARRANGEMENTS = ({'world_groups': 2, 'robots_per_process': 2}, {}, {'robots_per_process': 1})
 
 
 @pytest.fixture(scope='module')
@@ -33,10 +35,12 @@ def undisturbed(tmp_path_factory):
     """SHA-256 of the final weights and mean return of the evaluation, by number of updates."""
     results = {}
 
-    def find(updates: int) -> tuple[str, float]:
-        if updates not in results:
-            results[updates] = oracle(tmp_path_factory.mktemp('alone') / 'run', {**VALUES, 'total_steps': updates * 8 * 25})
-        return results[updates]
+    def find(updates: int, **changed) -> tuple[str, float]:
+        key = updates, *changed.items()
+        if key not in results:
+            values = {**VALUES, 'total_steps': updates * 8 * 25, **changed}
+            results[key] = oracle(tmp_path_factory.mktemp('alone') / 'run', values)
+        return results[key]
 
     return find
 
@@ -46,7 +50,10 @@ class Disturbed:
 
     def __init__(self, folder, updates: int, changed: dict):
         self.folder, self.updates = folder, updates
-        self.process = bringup(folder, {**VALUES, 'total_steps': updates * 8 * 25, **changed})
+        values = {**VALUES, 'total_steps': updates * 8 * 25, **changed}
+        self.process = bringup(folder, values)
+        settings = config.from_flat(values)
+        self.names = [process.name for process in training_graph(settings, RunFolder(folder, settings))]
 
     def kill(self, *nodes: str, by: int = signal.SIGKILL) -> list[str]:
         """Kills those of the nodes that run, or sends them another signal; their names."""
@@ -84,10 +91,11 @@ def disturb(domain, tmp_path):
         run.process.communicate()
 
 
-def victims(kills: int, draw: random.Random) -> list[tuple[str, ...]]:
-    """Whom to kill at once, as often: each kind of node, the trainer twice in a row, and then anyone, sometimes two."""
-    first = [('world',), (draw.choice(AGENTS),), ('parameter_server',), ('trainer',), ('trainer',)]
-    anyone = [tuple(draw.sample(NODES, draw.choice((1, 1, 2)))) for _ in range(kills - len(first))]
+def victims(processes: list[str], kills: int, draw: random.Random) -> list[tuple[str, ...]]:
+    """Whom to kill at once, as often: each kind of process, the trainer twice in a row, and then anyone, sometimes two."""
+    worlds, agents = ([name for name in processes if name.startswith(kind)] for kind in ('world', 'agent'))
+    first = [(draw.choice(worlds),), (draw.choice(agents),), ('parameter_server',), ('trainer',), ('trainer',)]
+    anyone = [tuple(draw.sample(processes, draw.choice((1, 1, 2)))) for _ in range(kills - len(first))]
     return (first + anyone)[:kills]
 
 
@@ -95,16 +103,17 @@ def test_the_run_ends_with_the_same_weights_whoever_is_killed_whenever(disturb, 
     """Kills when the training has come to versions drawn at random, and a moment later."""
     draw = random.Random(SEED)
     updates = max(UPDATES, 8 * KILLS)
-    run, killed = disturb(updates), []
+    arrangement = ARRANGEMENTS[SEED % len(ARRANGEMENTS)]
+    run, killed = disturb(updates, **arrangement), []
     with Listener() as listener:
         moments = sorted(draw.sample(range(updates - 3), KILLS - 1))
-        for version, nodes in zip([*moments, updates], victims(KILLS, draw)):  # the last one while it is evaluated
+        for version, nodes in zip([*moments, updates], victims(run.names, KILLS, draw)):  # the last one while it is evaluated
             listener.wait_for_status(lambda status: status.policy_version >= version)
             time.sleep(draw.uniform(0, 0.3))
             killed += run.kill(*nodes) or run.kill('trainer')  # which has just spoken
     print(f'{len(killed)} killed in {updates} updates: {", ".join(killed)}')
     assert len(killed) >= KILLS
-    run.assert_ends_with(undisturbed(updates))
+    run.assert_ends_with(undisturbed(updates, **arrangement))
 
 
 def test_the_server_serves_from_disk_before_a_trainer_is_back_that_lost_its_newest_checkpoint(make_graph, undisturbed, tmp_path):
@@ -130,14 +139,14 @@ def test_the_server_serves_from_disk_before_a_trainer_is_back_that_lost_its_newe
 
 
 def test_a_node_that_is_alive_but_silent_is_replaced_and_named(disturb, undisturbed):
-    run, told = disturb(silence_timeout=30.0), []
+    run, told = disturb(silence_timeout=30.0, robots_per_process=2), []
     with Listener() as listener:
         listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, lambda report: told.extend(report.status),
                                           qos.EVENTS)
         listener.wait_for_status(lambda status: status.policy_version >= 3)
-        assert run.kill('agent_1', by=signal.SIGSTOP)
-        sentence = 'agent_1 has said nothing for 30 s and is killed'
-        listener.spin_until(lambda: any((status.name, status.message) == ('/agent_1', sentence) for status in told))
+        assert run.kill('agents_0-1', by=signal.SIGSTOP)
+        sentence = 'agents_0-1 has said nothing for 30 s and is killed'
+        listener.spin_until(lambda: {status.name for status in told if status.message == sentence} == {'/agent_0', '/agent_1'})
     assert sentence in run.assert_ends_with(undisturbed(UPDATES))
 
 

@@ -53,6 +53,24 @@ def test_a_wrong_value_is_one_sentence(node, override, sentence, domain):
     assert sentence in failure(node, '-p', override)
 
 
+def test_the_agents_of_one_process_need_names_of_their_own(domain):
+    assert 'the agents of 2 robots cannot all be named scout' in failure('agent', '-p', 'robots:=2', '-r', '__node:=scout')
+
+
+def test_the_agents_of_one_process_are_nodes_with_parameters_of_their_own(domain):
+    process = start('agent', '-p', 'robot:=3', '-p', 'robots:=2', '-p', 'world_groups:=2', '-p', 'group:=1')
+    try:
+        with Listener() as listener:
+            for robot in (3, 4):
+                request = GetParameters.Request(names=['robot'])
+                value, = listener.call(GetParameters, f'agent_1_{robot}/get_parameters', request).values
+                assert value.integer_value == robot
+    finally:
+        process.terminate()
+        _, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 0 and 'Traceback' not in errors, errors
+
+
 def test_parameters_are_described_ranged_and_read_only_and_an_integer_beta_is_fine(domain, tmp_path):
     process = start('trainer', '-p', 'beta:=1', '-p', f'run_folder:={tmp_path / "run"}', '-p', 'learner_threads:=1')
     try:

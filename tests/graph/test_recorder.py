@@ -12,7 +12,7 @@ import pytest
 import yaml
 from dae_ros_msgs.msg import TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import REPOSITORY, SMALL, Listener
+from harness import REPOSITORY, SMALL, Listener, oracle
 from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
 
@@ -42,13 +42,13 @@ def trajectories(folder, values):
 class Recorder:
     """What the recorder says of itself on /diagnostics."""
 
-    def __init__(self, listener):
-        self.sentence, self.values = '', {}
+    def __init__(self, listener, name='recorder'):
+        self.sentence, self.values, self._name = '', {}, f'/{name}'
         listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._hear, qos.EVENTS)
 
     def _hear(self, report):
         for status in report.status:
-            if status.name == '/recorder':
+            if status.name == self._name:
                 self.sentence, self.values = status.message, {value.key: value.value for value in status.values}
 
 
@@ -82,6 +82,33 @@ def test_a_recorded_run_holds_every_message_and_its_trajectories_bit_for_bit(par
     assert [rollout.request.rollout for rollout in read] == list(range(len(expected)))
     assert all(np.array_equal(a, b) for live, rollout in zip(expected, read) for a, b in zip(live, rollout.trajectory))
     assert set(dataset.skipped) <= ({'truncated'} if code else set())
+
+
+def test_a_recorder_killed_and_started_again_disturbs_nothing_and_both_bags_are_read_as_one(make_graph, tmp_path):
+    values = {**SMALL, 'total_steps': 40 * 8 * 25}
+    graph = make_graph(tmp_path / 'graph', values)
+    for name in ('first', 'second'):
+        graph.processes[name] = NodeProcess('recorder', name, {'bag': str(tmp_path / 'bags' / name)})
+    with Listener() as listener:
+        first, second = Recorder(listener, 'first'), Recorder(listener, 'second')
+        graph.start(*(name for name in graph.names if name != 'second'))
+        listener.spin_until(lambda: int(first.values.get('messages', 0)) > 3 * 150, lambda: graph.log('first'))
+        graph.kill('first')
+        assert listener.call(Trigger, 'trainer/pause', Trigger.Request()).success
+        graph.start('second')
+        listener.spin_until(lambda: second.sentence == 'recording', lambda: graph.log('second'))
+        assert listener.call(Trigger, 'trainer/resume', Trigger.Request()).success
+        assert graph.wait() == 0, graph.log('trainer')
+    graph.stop()
+    expected = trajectories(tmp_path / 'alone', values)
+    assert graph.result() == oracle(tmp_path / 'oracle', values)
+    read = list(Dataset(f'{tmp_path / "bags"}/*').read())
+    rollouts = [rollout.request.rollout for rollout in read]
+    assert rollouts == sorted(set(rollouts)) and rollouts[-1] == len(expected) - 1
+    alone = [list(Dataset(tmp_path / 'bags' / name)) for name in ('first', 'second')]
+    assert all(alone) and len(read) in (sum(map(len, alone)), sum(map(len, alone)) + 1)  # one may lie in both
+    assert all(np.array_equal(a, b) for rollout in read
+               for a, b in zip(expected[rollout.request.rollout], rollout.trajectory))
 
 
 def test_what_the_recorder_writes_is_read_without_our_messages(make_graph, tmp_path):

@@ -9,8 +9,9 @@ from harness import SMALL, Listener, bringup, finish, oracle, processes_naming
 
 from dae_ros.report.summary import Summary
 
-GROUPS = {**SMALL, 'num_agents': 2, 'world_groups': 2}
-MATRIX_GAME = {**SMALL, 'task': 'matrix_game', 'num_agents': 4, 'num_steps': 4, 'total_steps': 5 * 8 * 4, 'beta': 1.0}
+GROUPS = {**SMALL, 'num_agents': 2, 'world_groups': 2, 'robots_per_process': 1}
+MATRIX_GAME = {**SMALL, 'task': 'matrix_game', 'num_agents': 4, 'num_steps': 4, 'total_steps': 5 * 8 * 4, 'beta': 1.0,
+               'robots_per_process': 3}
 
 
 @pytest.mark.parametrize('values', [SMALL, MATRIX_GAME, GROUPS], ids=['navigation', 'matrix_game', 'two groups'])
