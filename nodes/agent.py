@@ -9,11 +9,12 @@ import sys
 
 from dae_ros_msgs import msg, srv
 
-from dae_ros.config import SETTINGS, AgentSettings, GroupBinding, RunBinding, check_group, declarations
+from dae_ros.config import SETTINGS, AgentSettings, GroupBinding, RunBinding, TeamKey, check_group, declarations
 from dae_ros.errors import Refused
 from dae_ros.rollout.lockstep import AgentEnd, check_run
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.trust import team_key
 from dae_ros.types import Action
 from dae_ros.weights.codec import open_weights
 
@@ -24,12 +25,13 @@ class AgentNode(TeamNode):
     """Wires an `AgentEnd` to the topics of its group."""
 
     def __init__(self):
-        super().__init__('agent', [*declarations(AgentSettings, GroupBinding, RunBinding), SETTINGS['world_groups']])
+        super().__init__('agent', [*declarations(AgentSettings, GroupBinding, RunBinding, TeamKey), SETTINGS['world_groups']])
         robot, binding = self.settings['robot'], self.settings['run']
         self._group, self._world_groups = self.settings['group'], self.settings['world_groups']
         check_group(self._group, self._world_groups)
         self._end = AgentEnd(robot, binding, self._group)
         self._bound = binding != 0
+        self._key = team_key(self, self.settings['key_file'])
         self._unsent: msg.Action | None = None
         self._fetching: int | None = None
         observation, action = (names.in_group(topic.format(robot), self._group, self._world_groups)
@@ -59,7 +61,7 @@ class AgentNode(TeamNode):
     def _on_policy(self, message: msg.PolicyWeights) -> None:
         weights = convert.policy_weights(message)
         check_run(weights.run, self._end.run)
-        self._act(self._end.on_policy(weights.version, open_weights(weights)))
+        self._act(self._end.on_policy(weights.version, open_weights(weights, self._key)))
         self._fetch_if_passed()
 
     def _fetch_if_passed(self) -> None:

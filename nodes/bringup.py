@@ -32,6 +32,8 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--run-folder', type=Path, help='where the run goes; default runs/<task file>-<time>. A folder with '
                                                         'an unfinished run of the same settings resumes it')
     parser.add_argument('--namespace', default='', help='namespace of the team, so that several can run side by side')
+    parser.add_argument('--key-file', default='', help='file with the key that the team signs its policies with; without one '
+                                                       'they are not signed')
     parser.add_argument('--in-process', action='store_true', help='the same run, bit for bit, in this process without ROS')
     return parser.parse_args(arguments)
 
@@ -55,11 +57,11 @@ def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDis
         worlds.close()
 
 
-def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, display: ProgressDisplay) -> None:
+def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, key_file: str, display: ProgressDisplay) -> None:
     """The run as separate processes. Raises DaeRosError when it cannot go on."""
     from dae_ros.ros.graph_run import GraphRun
 
-    GraphRun(settings, folder, namespace, display).run()
+    GraphRun(settings, folder, namespace, key_file, display).run()
 
 
 def bring_up(arguments: argparse.Namespace) -> int:
@@ -79,7 +81,7 @@ def bring_up(arguments: argparse.Namespace) -> int:
         if arguments.in_process:
             train_in_process(settings, folder, display)
         else:
-            train_on_graph(settings, folder, arguments.namespace, display)
+            train_on_graph(settings, folder, arguments.namespace, arguments.key_file, display)
     print(Summary.read(folder.summary_file).lines())
     return 0
 

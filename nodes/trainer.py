@@ -22,6 +22,7 @@ from dae_ros.config import (
     RewardNetworkSettings,
     RunSettings,
     TaskSettings,
+    TeamKey,
     TrainerSettings,
     declarations,
     from_flat,
@@ -33,10 +34,10 @@ from dae_ros.restarts import EXIT_REFUSED
 from dae_ros.rollout.groups import GroupedAssembler
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.trust import team_key
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
-from dae_ros.types import PolicyWeights
-from dae_ros.weights.codec import encode_policy, sha256
+from dae_ros.weights.codec import encode_policy, seal
 from dae_ros.worlds import world_spec
 
 Status = msg.TrainingStatus
@@ -57,8 +58,9 @@ class TrainerNode(TeamNode):
 
     def __init__(self):
         super().__init__('trainer', declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings,
-                                                 TrainerSettings))
+                                                 TrainerSettings, TeamKey))
         folder = self.settings.pop('run_folder')
+        self._key = team_key(self, self.settings.pop('key_file'))
         settings = from_flat(self.settings)
         task = settings.task
         spec = world_spec(task)
@@ -195,8 +197,8 @@ class TrainerNode(TeamNode):
     def _publish_policy(self) -> None:
         if not self.context.ok():
             raise ExternalShutdownException()
-        data = encode_policy(self._training.policy)
-        weights = PolicyWeights(self._training.run, self._training.policy_version, sha256(data), data)
+        training = self._training
+        weights = seal(training.run, training.policy_version, encode_policy(training.policy), self._key)
         self._policy_update.publish(convert.policy_weights_message(weights))
 
     def _announce(self, state: int, detail: str) -> None:

@@ -13,6 +13,7 @@ from dae_ros_msgs import msg
 
 from dae_ros.errors import Refused
 from dae_ros.types import Action, JointState, Observation, PolicyWeights, RolloutRequest, SharedReward, Stamp
+from dae_ros.weights.codec import check_size
 
 _TYPECODES = {'f': np.float32, 'B': np.uint8, 'H': np.uint16}
 
@@ -116,8 +117,10 @@ def rollout_request(message: msg.RolloutRequest) -> RolloutRequest:
 def policy_weights_message(weights: PolicyWeights) -> msg.PolicyWeights:
     data = array('B')
     data.frombytes(weights.data)
-    return msg.PolicyWeights(run=weights.run, version=weights.version, sha256=weights.sha256, data=data)
+    return msg.PolicyWeights(run=weights.run, version=weights.version, sha256=weights.sha256, data=data,
+                             signature=weights.signature)
 
 
 def policy_weights(message: msg.PolicyWeights) -> PolicyWeights:
-    return PolicyWeights(message.run, message.version, message.sha256, bytes(message.data))
+    check_size(len(message.data))
+    return PolicyWeights(message.run, message.version, message.sha256, bytes(message.data), message.signature)

@@ -30,21 +30,23 @@ class NodeProcess(NamedTuple):
         return arguments
 
 
-def training_graph(settings: Settings, folder: RunFolder) -> list[NodeProcess]:
+def training_graph(settings: Settings, folder: RunFolder, key_file: str = '') -> list[NodeProcess]:
     """Parameter server, trainer and, for each group, a world and one agent per robot: the processes of one run."""
     run = {'run': folder.run}
+    key = {'key_file': str(Path(key_file).absolute())} if key_file else {}
     return [
-        *(process for group in range(settings.task.world_groups) for process in _group(settings, group, run)),
+        *(process for group in range(settings.task.world_groups) for process in _group(settings, group, run, key)),
         NodeProcess('parameter_server', 'parameter_server',
-                    {'policies_folder': str(folder.policies), 'keep_policies': settings.run.keep_checkpoints, **run}),
-        NodeProcess('trainer', 'trainer', {'run_folder': str(folder.path)}),
+                    {'policies_folder': str(folder.policies), 'keep_policies': settings.run.keep_checkpoints, **run,
+                     **key}),
+        NodeProcess('trainer', 'trainer', {'run_folder': str(folder.path), **key}),
     ]
 
 
-def _group(settings: Settings, group: int, run: dict[str, int]) -> list[NodeProcess]:
+def _group(settings: Settings, group: int, run: dict[str, int], key: dict[str, str]) -> list[NodeProcess]:
     """World and agents of one group, numbered where there are several."""
     mark = f'_{group}' if settings.task.world_groups > 1 else ''
-    agents = [NodeProcess('agent', f'agent{mark}_{robot}', {'group': group, 'robot': robot, **run})
+    agents = [NodeProcess('agent', f'agent{mark}_{robot}', {'group': group, 'robot': robot, **run, **key})
               for robot in range(settings.task.num_agents)]
     return [NodeProcess('world', f'world{mark}', {'group': group, **run}), *agents]
 

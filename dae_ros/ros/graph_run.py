@@ -35,11 +35,11 @@ STATES = {getattr(TrainingStatus, name): name.lower() for name in
 class GraphRun:
     """One run of a team in a namespace. What happens to it becomes a call in `run`'s thread, one after the other."""
 
-    def __init__(self, settings: Settings, folder: RunFolder, namespace: str, display: ProgressDisplay):
+    def __init__(self, settings: Settings, folder: RunFolder, namespace: str, key_file: str, display: ProgressDisplay):
         self._folder = folder
         self._namespace = namespace
         self._display = display
-        self._processes = {process.name: process for process in training_graph(settings, folder)}
+        self._processes = {process.name: process for process in training_graph(settings, folder, key_file)}
         # The processes that torchrun started learn with the trainer they found, and with no other.
         self._restarts = Restarts(settings.run.max_restarts if torchrun.size() == 1 else 0)
         self._signs = SignsOfLife(settings.run.silence_timeout)

@@ -14,6 +14,7 @@ from typing import Callable
 
 import rclpy
 from dae_ros_msgs.msg import TrainingStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 
 from dae_ros import config
@@ -38,11 +39,11 @@ SMALL = {'task': 'navigation', 'num_agents': 3, 'num_worlds': 8, 'num_steps': 25
 class Graph:
     """Node processes of one run, started one by one in the order a test wants."""
 
-    def __init__(self, path: Path, values: dict, namespace: str = ''):
+    def __init__(self, path: Path, values: dict, namespace: str = '', key_file: str = ''):
         settings = config.from_flat(values)
         self.folder = RunFolder(path, settings)
         self._namespace = namespace
-        self.processes = {process.name: process for process in training_graph(settings, self.folder)}
+        self.processes = {process.name: process for process in training_graph(settings, self.folder, key_file)}
         self._codes: dict[str, int] = {}
         self.pids: dict[str, int] = {}
         self._supervisor = Supervisor(path / 'logs', self._codes.__setitem__)
@@ -172,3 +173,18 @@ class Listener:
         self.spin_until(future.done)
         self.node.destroy_client(client)
         return future.result()
+
+
+class Refusals:
+    """How many messages each node says it refused, from /diagnostics."""
+
+    def __init__(self, listener: Listener):
+        self.counted: dict[tuple[str, str, str], int] = {}  # by node, topic and reason
+        listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._hear, qos.EVENTS)
+
+    def _hear(self, report: DiagnosticArray) -> None:
+        for status in report.status:
+            for entry in status.values:
+                if entry.key.startswith('refused '):
+                    _, topic, reason = entry.key.split()
+                    self.counted[status.name, topic, reason] = int(entry.value)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from array import array
-from collections import Counter
 
 from dae_ros_msgs import msg
-from diagnostic_msgs.msg import DiagnosticArray
-from harness import SMALL, Listener, oracle
+from harness import SMALL, Listener, Refusals, oracle
 
 from dae_ros.ros import names, qos
 
@@ -79,27 +77,19 @@ def bad_messages(run: int) -> list[tuple[type, str, object, str]]:
 def test_malformed_and_foreign_messages_are_counted_by_reason_and_change_no_weight(make_graph, tmp_path):
     values = {**SMALL, 'total_steps': 150 * 8 * 25}
     graph = make_graph(tmp_path / 'graph', values)
-    counted: Counter[tuple[str, str]] = Counter()
-
-    def hear(report: DiagnosticArray) -> None:
-        for status in report.status:
-            for entry in status.values:
-                if entry.key.startswith('refused '):
-                    counted[status.name, entry.key] = int(entry.value)
-
     with Listener() as listener:
         messages = bad_messages(graph.folder.run)
         publishers = {topic: listener.node.create_publisher(kind, topic, qos.LATCHED_INPUT) for kind, topic, _, _ in messages}
-        listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, hear, qos.EVENTS)
+        refusals = Refusals(listener)
         graph.start(*graph.names)
         listener.spin_until(lambda: all(publisher.get_subscription_count() for publisher in publishers.values()))
         listener.wait_for_status(lambda status: status.policy_version >= 1)
         for _, topic, message, _ in messages:
             publishers[topic].publish(message)
-        wanted = {f'refused {topic} {reason}' for _, topic, _, reason in messages}
+        wanted = {(topic, reason) for _, topic, _, reason in messages}
 
-        def missing() -> set[str]:
-            return wanted - {key for _, key in counted}
+        def missing() -> set[tuple[str, str]]:
+            return wanted - {(topic, reason) for _, topic, reason in refusals.counted}
 
         listener.spin_until(lambda: not missing(), lambda: f'not counted: {missing()}')
     assert graph.wait() == 0, graph.log('trainer')

@@ -46,7 +46,7 @@ def test_every_kind_of_datum_survives_the_trip_through_its_message():
     same(convert.shared_reward(convert.shared_reward_message(reward)), reward)
     request = RolloutRequest(7, 3, 1, 5, 2**63, 25, True)
     same(convert.rollout_request(convert.rollout_request_message(request)), request)
-    weights = PolicyWeights(7, 5, 'ab', b'\x00\xff1')
+    weights = PolicyWeights(7, 5, 'ab', b'\x00\xff1', 'cd')
     same(convert.policy_weights(convert.policy_weights_message(weights)), weights)
 
 
