@@ -46,6 +46,7 @@ class Graph:
         self.processes = {process.name: process for process in training_graph(settings, self.folder, key_file)}
         self._codes: dict[str, int] = {}
         self.pids: dict[str, int] = {}
+        self.prefixes: dict[str, list[str]] = {}  # of commands, by node
         self._supervisor = Supervisor(path / 'logs', self._codes.__setitem__)
 
     @property
@@ -55,7 +56,7 @@ class Graph:
     def start(self, *names: str) -> None:
         for name in names:
             process = self.processes[name]
-            command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
+            command = [*self.prefixes.get(name, ()), sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
                        *process.arguments(self.folder.settings_file, self._namespace)]
             self.pids[name] = self._supervisor.start(name, command, os.environ)
 
