@@ -19,16 +19,18 @@ from rclpy.serialization import deserialize_message, serialize_message
 from dae_ros.ros import names, qos
 from dae_ros.ros.recorded import team_topics
 
+LONGEST = 2**20  # bytes of a message it sends again
 EXTREMES = (0, 1, 2, 255, 2**16, 2**31 - 1, 2**31, 2**32 - 1)
 HOSTILE_TEXTS = ('', 'x' * 10_000, '\x1b[2J\x1b[31m', 'a\nb\r\0c', '[bold]%s{0}', '🤖' * 100)
 
 
 class Fuzzer:
-    """Sends one hostile message for each it hears of the team of robots in `run`; `sent` counts them by kind."""
+    """Sends a hostile message for each it hears of the team in `run`, and at most so many; `sent` counts them by kind."""
 
-    def __init__(self, listener: Listener, run: int, num_agents: int, seed: int):
+    def __init__(self, listener: Listener, run: int, num_agents: int, seed: int, most: int):
         self.sent: Counter[str] = Counter()
         self._run = run
+        self._most = most
         self._draw = random.Random(seed)
         self._newest = 0  # rollout asked for
         topics = {topic.name: (topic.kind, topic.profile) for topic in team_topics(num_agents, 1, everything=True)}
@@ -42,7 +44,8 @@ class Fuzzer:
             listener.node.create_subscription(kind, topic, partial(self._hear, topic), profile, raw=True)
 
     def _hear(self, topic: str, data: bytes) -> None:
-        if not self._known.isdisjoint(hash(data[4:len(data) - filled]) for filled in range(4)):  # DDS fills up to four bytes
+        forms = (hash(data[4:len(data) - filled]) for filled in range(4))  # DDS fills up to four bytes
+        if len(data) > LONGEST or not self._known.isdisjoint(forms):
             return
         self._known.add(hash(data[4:]))
         try:
@@ -52,9 +55,12 @@ class Fuzzer:
         self._heard[topic].append(data)
         if topic == names.ROLLOUT_REQUEST:
             self._newest = max(self._newest, message.rollout)
-        self._attack(self._draw.choice([topic for topic, heard in self._heard.items() if heard]))
+        if self.sent.total() < self._most:
+            self.attack()
 
-    def _attack(self, topic: str) -> None:
+    def attack(self) -> None:
+        """Sends one hostile message."""
+        topic = self._draw.choice([topic for topic, heard in self._heard.items() if heard])
         how = self._draw.choice((self._replayed, self._of_another_run, self._damaged, self._of_a_rollout_that_is_over,
                                  self._rubbish))
         data = self._draw.choice(self._heard[topic])
@@ -90,7 +96,7 @@ class Fuzzer:
             return None
         name = self._draw.choice(fields)
         values = getattr(message, name)
-        choices = [values[:-1], values + values[:1], values * 50, array(values.typecode)]
+        choices = [values[:-1], values + values[:1], values * 5, array(values.typecode)]
         if values.typecode == 'f' and values:
             place, wrong = self._draw.randrange(len(values)), self._draw.choice((float('nan'), float('inf'), -float('inf')))
             choices += [values[:place] + array('f', [wrong]) + values[place + 1:]] * 4

@@ -25,6 +25,7 @@ FAR = 2 ** 20  # a rollout that will never be reached
 KEY = bytes(range(32))
 UPDATES = 20
 SEED = 1
+HOSTILE = 3000  # messages from the fuzzer
 RAW_TOPIC = QoSProfile(depth=10, avoid_ros_namespace_conventions=True)  # a service, as DDS sees it
 
 
@@ -115,6 +116,12 @@ def call_services(listener: Listener) -> None:
         rubbish.publish(data)
 
 
+def learnt(status: msg.TrainingStatus) -> int:
+    """Updates so far, by a status that is not of the fuzzer's invention."""
+    genuine = (status.environment_steps, status.total_steps) == (status.policy_version * W * 25, UPDATES * W * 25)
+    return status.policy_version if genuine else 0
+
+
 def test_a_team_among_hostile_messages_counts_and_survives_them_all_and_ends_with_the_same_weights(domain, tmp_path):
     values = {**SMALL, 'total_steps': UPDATES * W * 25, 'rollout_timeout': 5.0}
     key_file = tmp_path / 'team.key'
@@ -122,16 +129,19 @@ def test_a_team_among_hostile_messages_counts_and_survives_them_all_and_ends_wit
     key_file.write_bytes(KEY)
     run = RunFolder(tmp_path / 'run', config.from_flat(values)).run
     with Listener() as listener:
-        refusals, fuzzer = Refusals(listener), Fuzzer(listener, run, N, SEED)
+        refusals, fuzzer = Refusals(listener), Fuzzer(listener, run, N, SEED, HOSTILE)
         messages = bad_messages(run)
         publishers = {topic: listener.node.create_publisher(kind, topic, qos.LATCHED_INPUT) for kind, topic, _, _ in messages}
         process = bringup(tmp_path / 'run', values, '--key-file', str(key_file))
         try:
-            listener.wait_for_status(lambda status: status.policy_version >= UPDATES // 2)
+            listener.wait_for_status(lambda status: learnt(status) >= UPDATES // 2)
             listener.call(Trigger, names.PAUSE, Trigger.Request())
             for _, topic, message, _ in messages:
                 publishers[topic].publish(message)
             call_services(listener)
+            while fuzzer.sent.total() < HOSTILE:  # where the team was quicker than the fuzzer
+                fuzzer.attack()
+                listener.executor.spin_once(0.001)
             wanted = {(topic, reason) for _, topic, _, reason in messages}
 
             def missing() -> set[tuple[str, str]]:
@@ -139,14 +149,14 @@ def test_a_team_among_hostile_messages_counts_and_survives_them_all_and_ends_wit
 
             listener.spin_until(lambda: not missing(), lambda: f'not counted: {missing()}')
             listener.call(Trigger, names.RESUME, Trigger.Request())
-            listener.wait_for_status(lambda status: status.run == run and status.policy_version == UPDATES)
+            listener.wait_for_status(lambda status: learnt(status) == UPDATES)
             code, output, errors = finish(process)
         finally:
             process.kill()
             process.communicate(timeout=TIMEOUT)
     assert code == 0, output + errors
     print(f'sent {dict(fuzzer.sent)}, refused {sum(refusals.counted.values())}')
-    assert fuzzer.sent.total() > 2000 and len(fuzzer.sent) == 5 and sum(refusals.counted.values()) > 1000
+    assert len(fuzzer.sent) == 5 and sum(refusals.counted.values()) > HOSTILE / 2
     summary = Summary.read(tmp_path / 'run' / 'summary.json')
     assert (summary.weights_sha256, summary.evaluation_return) == oracle(tmp_path / 'alone', values)
     logs = {path.stem: path.read_text() for path in (tmp_path / 'run' / 'logs').iterdir()}

@@ -11,6 +11,7 @@ import pytest
 from harness import SMALL, TIMEOUT, Graph, oracle
 from link import CLEAR, CUT, Link, Weather
 
+pytestmark = pytest.mark.slow
 UPDATES = 8
 VALUES = {**SMALL, 'total_steps': UPDATES * 8 * 25, 'rollout_timeout': 10.0}
 STORM = Weather(loss=0.05, delay=0.05, reorder=0.25)
