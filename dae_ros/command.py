@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import sys
 from typing import Callable
 
-from dae_ros.errors import DaeRosError
+from dae_ros.errors import DaeRosError, FileError
 from dae_ros.restarts import EXIT_REFUSED
 
+DISK_TROUBLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 EXIT_INTERRUPTED = 130  # as of a shell's command that was ended by Ctrl-C
 
 
@@ -19,9 +21,21 @@ def run_command(act: Callable[[], int], stopped: str) -> int:
     except KeyboardInterrupt:
         print(stopped, file=sys.stderr)
         return EXIT_INTERRUPTED
-    except DaeRosError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return EXIT_REFUSED
+    except (DaeRosError, OSError) as error:
+        return refuse(error)
+
+
+def refuse(error: DaeRosError | OSError) -> int:
+    """Tells the user what was wrong, in one sentence; the exit code. Raises an OSError on which the user has no bearing."""
+    if isinstance(error, OSError):
+        if error.errno not in DISK_TROUBLE:
+            raise error
+        error = FileError(f'cannot write {error.filename or "to the disk"}: {error.strerror}')
+    try:
+        print(f'error: {error}', file=sys.stderr, flush=True)
+    except OSError:
+        pass  # a log on that disk
+    return EXIT_REFUSED
 
 
 def interrupt_on_sigterm() -> None:

@@ -146,6 +146,8 @@ class GraphRun:
         if delay is None:
             log = self._supervisor.log_file(name)
             tail = log.read_text(errors='replace').splitlines()[-LOG_TAIL:]
+            if not os.statvfs(log).f_bavail:
+                tail.append(f'the disk that {log} lies on is full')
             raise DaeRosError('\n'.join([f'{name} {describe(code)}; the end of {log}:', *tail]))
         self._display.note(f'{name} {describe(code)} and is started again')
         self._due[name] = time.monotonic() + delay

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import signal
-import sys
 from collections import Counter
 from typing import Any, Callable, Iterable
 
@@ -22,9 +21,9 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
+from dae_ros.command import refuse
 from dae_ros.config import SettingInfo
 from dae_ros.errors import DaeRosError, Refused
-from dae_ros.restarts import EXIT_REFUSED
 from dae_ros.ros import names, params, qos
 
 try:
@@ -193,6 +192,5 @@ def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int
             rclpy.try_shutdown()
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
-    except DaeRosError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return EXIT_REFUSED
+    except (DaeRosError, OSError) as error:
+        return refuse(error)
