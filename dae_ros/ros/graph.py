@@ -25,6 +25,7 @@ class NodeProcess(NamedTuple):
         arguments = ['--ros-args', '--params-file', str(settings_file), '-r', f'__node:={self.name}']
         if namespace:
             arguments += ['-r', f'__ns:=/{namespace.strip("/")}']
+        arguments += enclave_arguments(self.name, namespace)
         for name, value in self.parameters.items():
             arguments += ['-p', f'{name}:={value}']
         return arguments
@@ -49,6 +50,13 @@ def _group(settings: Settings, group: int, run: dict[str, int], key: dict[str, s
     agents = [NodeProcess('agent', f'agent{mark}_{robot}', {'group': group, 'robot': robot, **run, **key})
               for robot in range(settings.task.num_agents)]
     return [NodeProcess('world', f'world{mark}', {'group': group, **run}), *agents]
+
+
+def enclave_arguments(name: str, namespace: str) -> list[str]:
+    """With SROS 2 switched on, what tells a node its enclave, which has the node's name."""
+    if os.environ.get('ROS_SECURITY_ENABLE') != 'true':
+        return []
+    return ['--enclave', f'{"/" + namespace.strip("/") if namespace else ""}/{name}']
 
 
 def find_task_file(name: str) -> Path:

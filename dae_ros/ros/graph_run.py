@@ -22,7 +22,7 @@ from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.restarts import Restarts, SignsOfLife, describe
 from dae_ros.ros import names, qos
-from dae_ros.ros.graph import node_environment, training_graph
+from dae_ros.ros.graph import enclave_arguments, node_environment, training_graph
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 
@@ -53,7 +53,8 @@ class GraphRun:
     def run(self) -> None:
         """Returns when the trainer is done. Raises DaeRosError when the run cannot go on; no process is left either way."""
         os.environ.update(node_environment())  # for this process too: it must hear the status
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        enclave = enclave_arguments('bringup', self._namespace)
+        rclpy.init(args=['--ros-args', *enclave], signal_handler_options=SignalHandlerOptions.NO)
         node = rclpy.create_node('bringup', namespace=self._namespace, start_parameter_services=False)
         node.create_subscription(TrainingStatus, names.TRAINING_STATUS, self._later(self._on_status), qos.LATCHED_INPUT)
         node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._later(self._on_diagnostics), qos.EVENTS)
