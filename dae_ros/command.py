@@ -25,6 +25,28 @@ def run_command(act: Callable[[], int], stopped: str) -> int:
         return refuse(error)
 
 
+_interrupts = 0  # since `interrupt_once`
+
+
+def interrupt_once() -> None:
+    """From here on the first SIGINT or SIGTERM raises KeyboardInterrupt. Further ones, which must not break into the cleaning up
+    that it begins, only have it hurry."""
+    def interrupt(number: int, frame) -> None:
+        global _interrupts
+        _interrupts += 1
+        if _interrupts == 1:
+            raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as in a job that was started in the background
+            signal.signal(number, interrupt)
+
+
+def hurried() -> bool:
+    """Whether whoever asked this process to end has asked again."""
+    return _interrupts > 1
+
+
 def refuse(error: DaeRosError | OSError) -> int:
     """Tells the user what was wrong, in one sentence; the exit code. Raises an OSError on which the user has no bearing."""
     if isinstance(error, OSError):

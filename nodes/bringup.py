@@ -10,15 +10,15 @@ import argparse
 import sys
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dae_ros import torchrun
-from dae_ros.command import interrupt_on_sigterm, run_command
+from dae_ros.command import interrupt_once, run_command
 from dae_ros.config import SETTINGS, Settings
-from dae_ros.report.progress import ProgressDisplay
-from dae_ros.report.summary import Summary
-from dae_ros.ros.graph import find_task_file, read_settings
-from dae_ros.run_folder import RunFolder
-from dae_ros.worlds import world_spec
+
+if TYPE_CHECKING:
+    from dae_ros.report.progress import ProgressDisplay
+    from dae_ros.run_folder import RunFolder
 
 
 def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
@@ -43,7 +43,7 @@ def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDis
     from dae_ros.final_report import write_report
     from dae_ros.rollout.in_process import train
     from dae_ros.training import Training
-    from dae_ros.worlds import make_worlds
+    from dae_ros.worlds import make_worlds, world_spec
 
     training, worlds = Training(settings, world_spec(settings.task), folder), make_worlds(settings.task)
     try:
@@ -71,6 +71,12 @@ def bring_up(arguments: argparse.Namespace) -> int:
 
         help_to_learn()
         return 0
+    # Here, because it takes a second in which Ctrl-C is to be heard.
+    from dae_ros.report.progress import ProgressDisplay
+    from dae_ros.report.summary import Summary
+    from dae_ros.ros.graph import find_task_file, read_settings
+    from dae_ros.run_folder import RunFolder
+
     task_file = find_task_file(arguments.task_file) if arguments.task_file else None
     settings = read_settings(task_file, arguments.parameter)
     stem = task_file.stem if task_file else settings.task.task.replace(':', '_')
@@ -87,8 +93,8 @@ def bring_up(arguments: argparse.Namespace) -> int:
 
 
 def main(args: list[str] | None = None) -> int:
+    interrupt_once()
     arguments = parse_arguments(args)
-    interrupt_on_sigterm()
     return run_command(lambda: bring_up(arguments), 'stopped; every process is down')
 
 
