@@ -16,6 +16,7 @@ setup(
         ('share/dae_ros', ['package.xml']),
         ('share/dae_ros/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
         ('share/dae_ros/config/bags', sorted(glob('config/bags/*.yaml'))),
+        ('share/dae_ros/config/sros2', sorted(glob('config/sros2/*.xml'))),
         ('share/dae_ros/launch', sorted(glob('launch/*.py'))),
     ],
     python_requires='>=3.10',

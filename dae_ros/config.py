@@ -165,6 +165,14 @@ class GroupBinding:
 
 
 @dataclass(frozen=True)
+class TeamKey:
+    """Whose policies are taken. Trainer, parameter server and agents have it."""
+
+    key_file: str = setting('', 'file with the key that policies are signed with, the same for trainer, parameter server and '
+                                'agents; empty for none')
+
+
+@dataclass(frozen=True)
 class AgentSettings:
     """What is particular to one agent."""
 

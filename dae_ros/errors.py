@@ -52,6 +52,7 @@ class Refused(DaeRosError):
     OUT_OF_RANGE = 'out_of_range'
     OVERSIZED = 'oversized'
     CORRUPT = 'corrupt'
+    FORGED = 'forged'
 
     def __init__(self, reason: str, detail: str):
         super().__init__(f'{reason}: {detail}')

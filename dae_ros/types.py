@@ -111,6 +111,7 @@ class PolicyWeights(NamedTuple):
     version: int
     sha256: str
     data: bytes
+    signature: str = ''        # empty where the team has no key
 
 
 class Trajectory(NamedTuple):

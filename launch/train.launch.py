@@ -22,7 +22,7 @@ RESPAWN_DELAY = 2.0  # s
 
 def start(context) -> list:
     """The nodes of the run that the launch arguments describe; when the trainer is done, or one keeps dying, all end."""
-    names = ('task_file', 'namespace', 'run_folder', 'parameters')
+    names = ('task_file', 'namespace', 'run_folder', 'key_file', 'parameters')
     argument = {name: LaunchConfiguration(name).perform(context) for name in names}
     task_file = find_task_file(argument['task_file'])
     settings = read_settings(task_file, argument['parameters'].split())
@@ -43,7 +43,7 @@ def start(context) -> list:
              name=None if process.several else process.name,
              parameters=[str(folder.settings_file), {name: value for name, value in process.parameters.items()}],
              output='screen', respawn=True, respawn_delay=RESPAWN_DELAY, on_exit=end_all(process.name))
-        for process in training_graph(settings, folder)]
+        for process in training_graph(settings, folder, argument['key_file'])]
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -51,6 +51,7 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument('task_file', default_value='navigation', description='a task file, or the name of one in config/'),
         DeclareLaunchArgument('namespace', default_value='', description='namespace of the team'),
         DeclareLaunchArgument('run_folder', default_value='', description='where the run goes; default runs/<task file>-<time>'),
+        DeclareLaunchArgument('key_file', default_value='', description='file with the key the team signs its policies with'),
         DeclareLaunchArgument('parameters', default_value='', description='settings to change: "seed:=2 beta:=1"'),
         OpaqueFunction(function=start),
     ])

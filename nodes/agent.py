@@ -11,15 +11,16 @@ import sys
 from dae_ros_msgs import msg, srv
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from dae_ros.config import SETTINGS, AgentSettings, GroupBinding, RunBinding, check_group, declarations
+from dae_ros.config import SETTINGS, AgentSettings, GroupBinding, RunBinding, TeamKey, check_group, declarations
 from dae_ros.errors import Refused, SettingsError
 from dae_ros.rollout.lockstep import AgentEnd, check_run
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run_together, settings_of_process
+from dae_ros.ros.trust import team_key
 from dae_ros.types import Action
 from dae_ros.weights.codec import open_weights
 
-DECLARED = [*declarations(AgentSettings, GroupBinding, RunBinding), SETTINGS['world_groups']]
+DECLARED = [*declarations(AgentSettings, GroupBinding, RunBinding, TeamKey), SETTINGS['world_groups']]
 GUID_PREFIX = 12  # bytes of an endpoint's id that all endpoints of a process have in common
 
 
@@ -33,6 +34,7 @@ class AgentNode(TeamNode):
         check_group(self._group, self._world_groups)
         self._end = AgentEnd(robot, binding, self._group)
         self._bound = binding != 0
+        self._key = team_key(self, self.settings['key_file'])
         self._unsent: msg.Action | None = None
         self._fetching: int | None = None
         observation, action = (names.in_group(topic.format(robot), self._group, self._world_groups)
@@ -68,7 +70,7 @@ class AgentNode(TeamNode):
     def _on_policy(self, message: msg.PolicyWeights) -> None:
         weights = convert.policy_weights(message)
         check_run(weights.run, self._end.run)
-        self._act(self._end.on_policy(weights.version, open_weights(weights)))
+        self._act(self._end.on_policy(weights.version, open_weights(weights, self._key)))
         self._fetch_if_passed()
 
     def _fetch_if_passed(self) -> None:

@@ -10,15 +10,15 @@ import argparse
 import sys
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dae_ros import torchrun
-from dae_ros.command import interrupt_on_sigterm, run_command
+from dae_ros.command import interrupt_once, run_command
 from dae_ros.config import SETTINGS, Settings
-from dae_ros.report.progress import ProgressDisplay
-from dae_ros.report.summary import Summary
-from dae_ros.ros.graph import find_task_file, read_settings
-from dae_ros.run_folder import RunFolder
-from dae_ros.worlds import world_spec
+
+if TYPE_CHECKING:
+    from dae_ros.report.progress import ProgressDisplay
+    from dae_ros.run_folder import RunFolder
 
 
 def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
@@ -32,6 +32,8 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--run-folder', type=Path, help='where the run goes; default runs/<task file>-<time>. A folder with '
                                                         'an unfinished run of the same settings resumes it')
     parser.add_argument('--namespace', default='', help='namespace of the team, so that several can run side by side')
+    parser.add_argument('--key-file', default='', help='file with the key that the team signs its policies with; without one '
+                                                       'they are not signed')
     parser.add_argument('--in-process', action='store_true', help='the same run, bit for bit, in this process without ROS')
     return parser.parse_args(arguments)
 
@@ -41,7 +43,7 @@ def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDis
     from dae_ros.final_report import write_report
     from dae_ros.rollout.in_process import train
     from dae_ros.training import Training
-    from dae_ros.worlds import make_worlds
+    from dae_ros.worlds import make_worlds, world_spec
 
     training, worlds = Training(settings, world_spec(settings.task), folder), make_worlds(settings.task)
     try:
@@ -55,11 +57,11 @@ def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDis
         worlds.close()
 
 
-def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, display: ProgressDisplay) -> None:
+def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, key_file: str, display: ProgressDisplay) -> None:
     """The run as separate processes. Raises DaeRosError when it cannot go on."""
     from dae_ros.ros.graph_run import GraphRun
 
-    GraphRun(settings, folder, namespace, display).run()
+    GraphRun(settings, folder, namespace, key_file, display).run()
 
 
 def bring_up(arguments: argparse.Namespace) -> int:
@@ -69,6 +71,12 @@ def bring_up(arguments: argparse.Namespace) -> int:
 
         help_to_learn()
         return 0
+    # Here, because it takes a second in which Ctrl-C is to be heard.
+    from dae_ros.report.progress import ProgressDisplay
+    from dae_ros.report.summary import Summary
+    from dae_ros.ros.graph import find_task_file, read_settings
+    from dae_ros.run_folder import RunFolder
+
     task_file = find_task_file(arguments.task_file) if arguments.task_file else None
     settings = read_settings(task_file, arguments.parameter)
     stem = task_file.stem if task_file else settings.task.task.replace(':', '_')
@@ -79,14 +87,14 @@ def bring_up(arguments: argparse.Namespace) -> int:
         if arguments.in_process:
             train_in_process(settings, folder, display)
         else:
-            train_on_graph(settings, folder, arguments.namespace, display)
+            train_on_graph(settings, folder, arguments.namespace, arguments.key_file, display)
     print(Summary.read(folder.summary_file).lines())
     return 0
 
 
 def main(args: list[str] | None = None) -> int:
+    interrupt_once()
     arguments = parse_arguments(args)
-    interrupt_on_sigterm()
     return run_command(lambda: bring_up(arguments), 'stopped; every process is down')
 
 

@@ -10,13 +10,14 @@ from pathlib import Path
 
 from dae_ros_msgs import msg, srv
 
-from dae_ros.config import ParameterServerSettings, RunBinding, declarations
+from dae_ros.config import ParameterServerSettings, RunBinding, TeamKey, declarations
 from dae_ros.errors import Refused, RunFolderError
 from dae_ros.rollout.lockstep import check_run
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.trust import team_key
 from dae_ros.types import PolicyWeights
-from dae_ros.weights.codec import open_weights, sha256
+from dae_ros.weights.codec import open_weights, seal
 from dae_ros.weights.store import PolicyStore
 
 NEWEST = 2**64 - 1
@@ -26,7 +27,8 @@ class ParameterServerNode(TeamNode):
     """Serves a `PolicyStore`; one folder for each run."""
 
     def __init__(self):
-        super().__init__('parameter_server', declarations(ParameterServerSettings, RunBinding))
+        super().__init__('parameter_server', declarations(ParameterServerSettings, RunBinding, TeamKey))
+        self._key = team_key(self, self.settings['key_file'])
         self._run = self.settings['run']
         self._bound = self._run != 0
         self._store: PolicyStore | None = None
@@ -47,7 +49,7 @@ class ParameterServerNode(TeamNode):
             raise RunFolderError(f'cannot write the policies to {folder}: {error.strerror}') from error
         newest = self._store.newest()
         if newest is not None:
-            self._publish(PolicyWeights(self._run, newest[0], sha256(newest[1]), newest[1]))
+            self._publish(seal(self._run, *newest, self._key))
 
     def _publish(self, weights: PolicyWeights) -> None:
         self._version = weights.version
@@ -56,7 +58,7 @@ class ParameterServerNode(TeamNode):
     def _on_update(self, message: msg.PolicyWeights) -> None:
         weights = convert.policy_weights(message)
         check_run(weights.run, self._run)
-        open_weights(weights)
+        open_weights(weights, self._key)
         if self._store is None:
             self._run = weights.run
             self._open_store()
@@ -72,7 +74,7 @@ class ParameterServerNode(TeamNode):
             response.message = 'there is no policy yet' if self._version is None else f'policy version {version} is not kept'
             return response
         response.success = True
-        response.policy = convert.policy_weights_message(PolicyWeights(self._run, version, sha256(data), data))
+        response.policy = convert.policy_weights_message(seal(self._run, version, data, self._key))
         return response
 
     def _on_status(self, message: msg.TrainingStatus) -> None:

@@ -30,24 +30,27 @@ class RecorderNode(TeamNode):
         path = Path(settings['bag'] or f'bags/{datetime.now():%Y%m%d-%H%M%S}')
         self._gaps = Gaps()
         self._missed: Counter[str] = Counter()
-        self._newest = 0
+        self._clock = time.time_ns() - time.monotonic_ns()  # what is set later neither stops it nor changes the order
         self._recording = Recording(path, [as_written(*topic) for topic in zip(topics, full_names)], settings['storage'],
                                     settings['compression'], settings['split_megabytes'] * 10**6,
                                     settings['split_seconds'] * 10**9)
         self._subscriptions_by_name = {
             topic.name: self.listen(topic.kind, topic.name, topic.profile, partial(self._record, topic, full_name), raw=True)
             for topic, full_name in zip(topics, full_names)}
-        self.every(FLUSH_PERIOD / 1e9, lambda: self._recording.flush_if_due(time.time_ns()))
+        self.every(FLUSH_PERIOD / 1e9, lambda: self._recording.flush_if_due(self._now()))
         self.get_logger().info(f'recording {len(topics)} topics in {self._recording.path}')
 
     def _record(self, topic: RecordedTopic, full_name: str, data: bytes) -> None:
-        self._newest = max(self._newest, time.time_ns())  # a clock that is set back does not change the order
-        self._recording.write(full_name, self._newest, data)
+        self._recording.write(full_name, self._now(), data)
         missing = self._gaps.missing(full_name, data) if topic.stamped else 0
         if missing:
             if not self._missed[full_name]:
                 self.get_logger().warning(f'{missing} messages on {full_name} were missed (further ones are only counted)')
             self._missed[full_name] += missing
+
+    def _now(self) -> int:
+        """The host's clock as it was set when the recorder began [ns]."""
+        return self._clock + time.monotonic_ns()
 
     def diagnose(self):
         silent = [name for name, subscription in self._subscriptions_by_name.items() if not subscription.get_publisher_count()]

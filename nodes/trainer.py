@@ -22,6 +22,7 @@ from dae_ros.config import (
     RewardNetworkSettings,
     RunSettings,
     TaskSettings,
+    TeamKey,
     TrainerSettings,
     declarations,
     from_flat,
@@ -33,10 +34,10 @@ from dae_ros.restarts import EXIT_REFUSED
 from dae_ros.rollout.groups import GroupedAssembler
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.trust import team_key
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
-from dae_ros.types import PolicyWeights
-from dae_ros.weights.codec import encode_policy, sha256
+from dae_ros.weights.codec import encode_policy, seal
 from dae_ros.worlds import world_spec
 
 Status = msg.TrainingStatus
@@ -57,8 +58,9 @@ class TrainerNode(TeamNode):
 
     def __init__(self):
         super().__init__('trainer', declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings,
-                                                 TrainerSettings))
+                                                 TrainerSettings, TeamKey))
         folder = self.settings.pop('run_folder')
+        self._key = team_key(self, self.settings.pop('key_file'))
         settings = from_flat(self.settings)
         task = settings.task
         spec = world_spec(task)
@@ -76,6 +78,9 @@ class TrainerNode(TeamNode):
         self.create_service(Trigger, names.PAUSE, self._on_pause)
         self.create_service(Trigger, names.RESUME, self._on_resume)
         self.create_service(Trigger, names.SAVE, self._on_save)
+        self.listen(Status, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
+        self._rival: Status | None = None  # of another trainer that is at work here
+        self._answered = False  # whether anything has ever arrived
         self._heard = False  # whether anything of the rollout under way has arrived, and when the last of it; s, monotonic
         self._heard_at = 0.0
         self._silent_attempts = 0  # in a row
@@ -154,7 +159,7 @@ class TrainerNode(TeamNode):
 
     def _collected(self) -> None:
         """Learns once the rollout is complete."""
-        self._heard, self._heard_at = True, time.monotonic()
+        self._heard, self._heard_at, self._answered = True, time.monotonic(), True
         if not self._assembler.complete:
             return
         self._patience, self._silent_attempts = self._training.settings.run.rollout_timeout, 0
@@ -173,6 +178,7 @@ class TrainerNode(TeamNode):
         patience = min(self._patience, settings.rollout_timeout)
         if not self._collecting or time.monotonic() - self._heard_at < patience:
             return
+        self._make_way()
         sentence = f'nothing heard for {patience:g} s; missing: {self._assembler.missing()}'
         self._silent_attempts += 1
         if self._silent_attempts >= settings.max_silent_attempts:
@@ -181,7 +187,23 @@ class TrainerNode(TeamNode):
         if patience == settings.rollout_timeout:
             self._announce(self._state, sentence)
         self._patience = 2 * patience  # worlds may be slow
+        self._publish_policy()  # an older one that somebody sent again may have taken its place
         self._advance()
+
+    def _on_status(self, status: Status) -> None:
+        """Takes note of another trainer."""
+        if status.run == self._training.run:
+            return
+        self._rival = None if status.state in (Status.FINISHED, Status.FAILED) else status
+        if not self._answered:
+            self._patience = SHORT_PATIENCE
+
+    def _make_way(self) -> None:
+        """Raises StalledError if the team, which has never answered, is another trainer's."""
+        rival = self._rival
+        if rival is not None and not self._answered:
+            raise StalledError(f'another trainer is at work here: its run {rival.run:x} has {rival.environment_steps} of '
+                               f'{rival.total_steps} steps. Start this one in a namespace of its own, or when that one is done')
 
     def _finish(self) -> None:
         self._announce(Status.EVALUATING, 'drawing the report')
@@ -195,8 +217,8 @@ class TrainerNode(TeamNode):
     def _publish_policy(self) -> None:
         if not self.context.ok():
             raise ExternalShutdownException()
-        data = encode_policy(self._training.policy)
-        weights = PolicyWeights(self._training.run, self._training.policy_version, sha256(data), data)
+        training = self._training
+        weights = seal(training.run, training.policy_version, encode_policy(training.policy), self._key)
         self._policy_update.publish(convert.policy_weights_message(weights))
 
     def _announce(self, state: int, detail: str) -> None:

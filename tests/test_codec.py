@@ -188,26 +188,30 @@ def test_a_file_without_a_checksum_is_refused():
         assert reason_for(save(random_tensors(SIZES), metadata=metadata), decode) == 'corrupt'
 
 
+def opened(weights):
+    return codec.open_weights(weights, None)
+
+
 def weights(data, **changed):
     return PolicyWeights(1, 2, codec.sha256(data), data)._replace(**changed)
 
 
 def test_the_weights_of_a_message_are_opened_if_their_checksum_is_right():
     data = codec.encode_policy(random_policy())
-    assert_same(codec.open_weights(weights(data)).tensors, random_policy().tensors)
+    assert_same(opened(weights(data)).tensors, random_policy().tensors)
     for checksum in ('', codec.sha256(data + b'x'), 'é'):
-        assert reason_for(weights(data, sha256=checksum), codec.open_weights) == 'corrupt'
+        assert reason_for(weights(data, sha256=checksum), opened) == 'corrupt'
     damaged = data[:-1] + bytes([data[-1] ^ 1])
-    assert reason_for(weights(damaged, sha256=codec.sha256(data)), codec.open_weights) == 'corrupt'
+    assert reason_for(weights(damaged, sha256=codec.sha256(data)), opened) == 'corrupt'
 
 
 def test_the_weights_of_a_message_may_be_so_large_and_not_a_byte_larger(monkeypatch):
     data = codec.encode_policy(random_policy())
     monkeypatch.setattr(codec, 'MAX_POLICY_BYTES', len(data))
-    codec.open_weights(weights(data))
+    opened(weights(data))
     monkeypatch.setattr(codec, 'MAX_POLICY_BYTES', len(data) - 1)
-    assert reason_for(weights(data), codec.open_weights) == 'oversized'
-    assert reason_for(weights(data, sha256='unread'), codec.open_weights) == 'oversized'
+    assert reason_for(weights(data), opened) == 'oversized'
+    assert reason_for(weights(data, sha256='unread'), opened) == 'oversized'
 
 
 # What is something else.

@@ -14,7 +14,8 @@ from dae_ros.errors import SettingsError
 
 REPOSITORY = Path(__file__).parent.parent
 TASK_FILES = sorted((REPOSITORY / 'config').glob('*.yaml'))
-NODE_GROUPS = (config.RunBinding, config.AgentSettings, config.ParameterServerSettings, config.TrainerSettings)
+NODE_GROUPS = (config.RunBinding, config.AgentSettings, config.ParameterServerSettings, config.TrainerSettings,
+               config.TeamKey)
 DECLARATIONS = [*SETTINGS.values(), *config.declarations(*NODE_GROUPS)]
 RANGED = [info for info in DECLARATIONS if info.minimum is not None]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import threading
 from pathlib import Path
 from typing import Mapping
 
@@ -29,6 +30,7 @@ class MetricsLog:
         self._names = lines[0].strip().split(',') if lines else None
         kept = lines[:1] + [line for line in lines[1:] if _steps(line) <= resume_at]
         write_atomically(path, ''.join(kept).encode())
+        threading.excepthook = _left_to_the_next_write
         self._file = open(path, 'a', encoding='utf-8', newline='')
         self._rows = csv.writer(self._file, lineterminator='\n')
         self._events = SummaryWriter(str(folder / 'tensorboard'), purge_step=0 if resume_at is None else resume_at + 1,
@@ -63,6 +65,12 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f'{path} has rows that are not as long as its header')
     table = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
     return dict(zip(names, table.T))
+
+
+def _left_to_the_next_write(failure: threading.ExceptHookArgs) -> None:
+    """TensorBoard writes in a thread of its own and raises at the next event what went wrong there; nobody is told twice."""
+    if not issubclass(failure.exc_type, OSError):
+        threading.__excepthook__(failure)
 
 
 def _whole_lines(path: Path) -> list[str]:

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from dae_ros.report.style import rounded, signed
 
 LINE_PERIOD = 5.0  # s between two lines where there is no terminal
+LONGEST = 1e9  # s; nobody is told of more
 
 
 class ProgressDisplay:
@@ -33,8 +34,9 @@ class ProgressDisplay:
         self._progress.stop()
 
     def note(self, text: str) -> None:
-        """Prints a line, above the bar if there is one."""
-        self._console.print(text, markup=False, soft_wrap=True)
+        """Prints a line, above the bar if there is one. What would command the terminal is left out."""
+        shown = ''.join(letter for letter in text if letter.isprintable() or letter == '\n')
+        self._console.print(shown, markup=False, soft_wrap=True)
 
     def update(self, state: str, environment_steps: int, total_steps: int, mean_return: float, steps_per_second: float,
                policy_version: int) -> None:
@@ -44,8 +46,8 @@ class ProgressDisplay:
         facts = f'{rounded(environment_steps)}/{rounded(total_steps)} steps'
         if math.isfinite(mean_return):
             facts += f', return {signed(mean_return)}'
-        if steps_per_second:
-            left = (total_steps - environment_steps) / steps_per_second
+        if 0 < steps_per_second < math.inf:
+            left = min(max(total_steps - environment_steps, 0) / steps_per_second, LONGEST)
             facts += f', {steps_per_second:,.0f}/s, policy {policy_version}, {_duration(left)} left'
         self._progress.update(self._bar, description=state, completed=environment_steps, total=total_steps, facts=facts)
         now = time.monotonic()

@@ -6,6 +6,7 @@ element. What comes in is checked for its sizes before it is given a shape; `Ref
 
 from __future__ import annotations
 
+import math
 from array import array
 
 import numpy as np
@@ -13,7 +14,9 @@ from dae_ros_msgs import msg
 
 from dae_ros.errors import Refused
 from dae_ros.types import Action, JointState, Observation, PolicyWeights, RolloutRequest, SharedReward, Stamp
+from dae_ros.weights.codec import check_size
 
+MAX_VALUES = 2**40  # of an array; no message comes near it
 _TYPECODES = {'f': np.float32, 'B': np.uint8, 'H': np.uint16}
 
 
@@ -25,10 +28,8 @@ def _field(typecode: str, values: np.ndarray) -> array:
 
 def _array(field: array, *shape: int) -> np.ndarray:
     """The field's values in `shape`; a view, which keeps the message's memory alive."""
-    size = 1
-    for length in shape:
-        size *= length
-    if len(field) != size:
+    size = math.prod(shape)
+    if len(field) != size or math.prod(filter(None, shape)) > MAX_VALUES:  # numpy counts so, also where there are none
         raise Refused(Refused.WRONG_SHAPE, f'{len(field)} values where the message says {" x ".join(map(str, shape))}')
     if not size:
         return np.empty(shape, _TYPECODES[field.typecode])
@@ -116,8 +117,10 @@ def rollout_request(message: msg.RolloutRequest) -> RolloutRequest:
 def policy_weights_message(weights: PolicyWeights) -> msg.PolicyWeights:
     data = array('B')
     data.frombytes(weights.data)
-    return msg.PolicyWeights(run=weights.run, version=weights.version, sha256=weights.sha256, data=data)
+    return msg.PolicyWeights(run=weights.run, version=weights.version, sha256=weights.sha256, data=data,
+                             signature=weights.signature)
 
 
 def policy_weights(message: msg.PolicyWeights) -> PolicyWeights:
-    return PolicyWeights(message.run, message.version, message.sha256, bytes(message.data))
+    check_size(len(message.data))
+    return PolicyWeights(message.run, message.version, message.sha256, bytes(message.data), message.signature)

@@ -34,39 +34,49 @@ class NodeProcess(NamedTuple):
             arguments += ['-r', f'__node:={self.name}']
         if namespace:
             arguments += ['-r', f'__ns:=/{namespace.strip("/")}']
+        arguments += enclave_arguments(self.name, namespace)
         for name, value in self.parameters.items():
             arguments += ['-p', f'{name}:={value}']
         return arguments
 
 
-def training_graph(settings: Settings, folder: RunFolder) -> list[NodeProcess]:
+def training_graph(settings: Settings, folder: RunFolder, key_file: str = '') -> list[NodeProcess]:
     """Parameter server, trainer and, for each group, a world and its robots' agents: the processes of one run."""
     run = {'run': folder.run}
+    key = {'key_file': str(Path(key_file).absolute())} if key_file else {}
     return [
-        *(process for group in range(settings.task.world_groups) for process in _group(settings, group, run)),
+        *(process for group in range(settings.task.world_groups) for process in _group(settings, group, run, key)),
         NodeProcess('parameter_server', 'parameter_server',
-                    {'policies_folder': str(folder.policies), 'keep_policies': settings.run.keep_checkpoints, **run}),
-        NodeProcess('trainer', 'trainer', {'run_folder': str(folder.path)}),
+                    {'policies_folder': str(folder.policies), 'keep_policies': settings.run.keep_checkpoints, **run,
+                     **key}),
+        NodeProcess('trainer', 'trainer', {'run_folder': str(folder.path), **key}),
     ]
 
 
-def _group(settings: Settings, group: int, run: dict[str, int]) -> list[NodeProcess]:
+def _group(settings: Settings, group: int, run: dict[str, int], key: dict[str, str]) -> list[NodeProcess]:
     """World and agents of one group, numbered where there are several."""
     task = settings.task
     mark = f'_{group}' if task.world_groups > 1 else ''
     together = settings.run.robots_per_process or task.num_agents
     teams = [range(first, min(first + together, task.num_agents)) for first in range(0, task.num_agents, together)]
     return [NodeProcess('world', f'world{mark}', {'group': group, **run}),
-            *(_agents(robots, group, task.world_groups, mark, run) for robots in teams)]
+            *(_agents(robots, group, task.world_groups, mark, {**run, **key}) for robots in teams)]
 
 
-def _agents(robots: range, group: int, world_groups: int, mark: str, run: dict[str, int]) -> NodeProcess:
+def _agents(robots: range, group: int, world_groups: int, mark: str, given: dict[str, int | str]) -> NodeProcess:
     """The agents of some robots of a group."""
     nodes = tuple(names.agent_node(robot, group, world_groups) for robot in robots)
-    parameters = {'group': group, 'robot': robots[0], **run}
+    parameters = {'group': group, 'robot': robots[0], **given}
     if len(robots) == 1:
         return NodeProcess('agent', nodes[0], parameters)
     return NodeProcess('agent', f'agents{mark}_{robots[0]}-{robots[-1]}', {**parameters, 'robots': len(robots)}, nodes)
+
+
+def enclave_arguments(name: str, namespace: str) -> list[str]:
+    """With SROS 2 switched on, what tells a node its enclave, which has the node's name."""
+    if os.environ.get('ROS_SECURITY_ENABLE') != 'true':
+        return []
+    return ['--enclave', f'{"/" + namespace.strip("/") if namespace else ""}/{name}']
 
 
 def find_task_file(name: str) -> Path:

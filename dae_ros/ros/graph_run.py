@@ -22,7 +22,7 @@ from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.restarts import Restarts, SignsOfLife, describe
 from dae_ros.ros import names, qos, shared_memory
-from dae_ros.ros.graph import node_environment, training_graph
+from dae_ros.ros.graph import enclave_arguments, node_environment, training_graph
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 
@@ -35,11 +35,11 @@ STATES = {getattr(TrainingStatus, name): name.lower() for name in
 class GraphRun:
     """One run of a team in a namespace. What happens to it becomes a call in `run`'s thread, one after the other."""
 
-    def __init__(self, settings: Settings, folder: RunFolder, namespace: str, display: ProgressDisplay):
+    def __init__(self, settings: Settings, folder: RunFolder, namespace: str, key_file: str, display: ProgressDisplay):
         self._folder = folder
         self._namespace = namespace
         self._display = display
-        self._processes = {process.name: process for process in training_graph(settings, folder)}
+        self._processes = {process.name: process for process in training_graph(settings, folder, key_file)}
         # The processes that torchrun started learn with the trainer they found, and with no other.
         self._restarts = Restarts(settings.run.max_restarts if torchrun.size() == 1 else 0)
         self._signs = SignsOfLife(settings.run.silence_timeout)
@@ -53,7 +53,8 @@ class GraphRun:
     def run(self) -> None:
         """Returns when the trainer is done. Raises DaeRosError when the run cannot go on; no process is left either way."""
         os.environ.update(node_environment())  # for this process too: it must hear the status
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        enclave = enclave_arguments('bringup', self._namespace)
+        rclpy.init(args=['--ros-args', *enclave], signal_handler_options=SignalHandlerOptions.NO)
         node = rclpy.create_node('bringup', namespace=self._namespace, start_parameter_services=False)
         node.create_subscription(TrainingStatus, names.TRAINING_STATUS, self._later(self._on_status), qos.LATCHED_INPUT)
         node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._later(self._on_diagnostics), qos.EVENTS)
@@ -149,6 +150,8 @@ class GraphRun:
         if delay is None:
             log = self._supervisor.log_file(name)
             tail = log.read_text(errors='replace').splitlines()[-LOG_TAIL:]
+            if not os.statvfs(log).f_bavail:
+                tail.append(f'the disk that {log} lies on is full')
             raise DaeRosError('\n'.join([f'{name} {describe(code)}; the end of {log}:', *tail]))
         self._display.note(f'{name} {describe(code)} and is started again')
         self._due[name] = time.monotonic() + delay

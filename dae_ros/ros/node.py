@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import gc
 import signal
-import sys
 from collections import Counter
 from contextlib import contextmanager
 from typing import Any, Callable, Iterable, Iterator
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
+from dae_ros.command import refuse
 from dae_ros.config import SettingInfo
 from dae_ros.errors import DaeRosError, Refused
-from dae_ros.restarts import EXIT_REFUSED
 from dae_ros.ros import names, params, qos
 
 try:
@@ -31,7 +34,25 @@ except ImportError:  # an older Jazzy: its executor builds a wait set of everyth
     from rclpy.executors import SingleThreadedExecutor as Executor
 
 DIAGNOSTICS_PERIOD = 1.0  # s
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 LONG = 3600.0  # s; without a limit this executor does not wait but spins
+
+
+_READ_ONLY = SetParametersResult(successful=False, reason='settings are read-only: start the node with others')
+
+
+def _set_none(request: SetParameters.Request, response: SetParameters.Response) -> SetParameters.Response:
+    response.results = [_READ_ONLY] * len(request.parameters)
+    return response
+
+
+def _set_none_of_all(_: SetParametersAtomically.Request,
+                     response: SetParametersAtomically.Response) -> SetParametersAtomically.Response:
+    response.result = _READ_ONLY
+    return response
+
+
+_REFUSALS = {SetParameters: _set_none, SetParametersAtomically: _set_none_of_all}
 
 
 class TeamNode(Node):
@@ -76,8 +97,13 @@ class TeamNode(Node):
         return self.create_subscription(kind, topic, self._guarded(receive), profile, event_callbacks=callbacks, raw=raw)
 
     def every(self, period: float, act: Callable[[], None]) -> Timer:
-        """A timer that calls `act` each `period` seconds."""
-        return self.create_timer(period, self._guarded(act))
+        """A timer that calls `act` each `period` seconds, whatever becomes of the host's clock or of simulated time."""
+        return self.create_timer(period, self._guarded(act), clock=STEADY)
+
+    def create_service(self, srv_type: type, srv_name: str, callback: Callable, **options) -> Service:
+        """A service. Those with which rclpy lets anyone change parameters refuse: it would fall over a value of an unknown type,
+        and with simulated time switched on the node's clock stands still."""
+        return super().create_service(srv_type, srv_name, _REFUSALS.get(srv_type, callback), **options)
 
     def _guarded(self, act: Callable[..., None]) -> Callable[..., None]:
         """`act` as a callback whose error `run` raises: raised into the executor, it would also be logged as the executor's."""
@@ -193,6 +219,5 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
             rclpy.try_shutdown()
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
-    except DaeRosError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return EXIT_REFUSED
+    except (DaeRosError, OSError) as error:
+        return refuse(error)

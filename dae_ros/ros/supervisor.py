@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -11,7 +12,10 @@ import time
 from pathlib import Path
 from typing import Callable, Mapping
 
+from dae_ros.command import hurried
+
 GRACE = 8.0  # s from the request to stop until a process is killed
+GLANCE = 0.1  # s between looks at whether it is to hurry
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
@@ -35,10 +39,19 @@ class Supervisor:
 
     def start(self, name: str, command: list[str], environment: Mapping[str, str]) -> int:
         """Starts a process in a session of its own: Ctrl-C in the terminal reaches the supervisor alone. Its process id."""
-        with open(self.log_file(name), 'ab') as log:
-            process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                                       start_new_session=True, preexec_fn=_end_with_parent)
-        self._processes[name] = process
+        def prepare() -> None:
+            _end_with_parent()
+            signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
+
+        # An interrupt in the middle would leave a process that nobody knows of.
+        unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+        try:
+            with open(self.log_file(name), 'ab') as log:
+                process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                                           start_new_session=True, preexec_fn=prepare)
+            self._processes[name] = process
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
         threading.Thread(target=self._watch, args=(name, process), daemon=True).start()
         return process.pid
 
@@ -57,14 +70,17 @@ class Supervisor:
         return self._processes[name].wait(timeout)
 
     def stop(self) -> None:
-        """Asks every process to end and kills what has not within `GRACE` seconds. May be interrupted: then kills at once."""
+        """Asks every process to end and kills what has not within `GRACE` seconds, or when it is interrupted again."""
         try:
             self._signal(signal.SIGINT)
             deadline = time.monotonic() + GRACE
             for process in self._processes.values():
-                process.wait(max(0.0, deadline - time.monotonic()))
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):
-            self._signal(signal.SIGKILL)
+                while process.poll() is None and time.monotonic() < deadline and not hurried():
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        process.wait(GLANCE)
+        except KeyboardInterrupt:
+            pass
+        self._signal(signal.SIGKILL)
         for process in self._processes.values():
             process.wait()
 

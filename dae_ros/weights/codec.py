@@ -17,6 +17,7 @@ from safetensors.numpy import load, save
 from dae_ros.errors import Refused
 from dae_ros.learning.policy import Policy, PolicyArchitecture
 from dae_ros.types import PolicyWeights
+from dae_ros.weights.signing import check_signature, sign
 
 POLICY_FORMAT = 'dae_ros.policy/1'
 CHECKPOINT_FORMAT = 'dae_ros.checkpoint/1'
@@ -45,10 +46,21 @@ def encode_policy(policy: Policy) -> bytes:
     return _encode(POLICY_FORMAT, policy.tensors, policy.architecture._asdict())
 
 
-def open_weights(weights: PolicyWeights) -> Policy:
-    """The policy in a message. Raises Refused if it is too large, damaged or something else."""
-    if len(weights.data) > MAX_POLICY_BYTES:
-        raise Refused(Refused.OVERSIZED, f'{len(weights.data)} bytes of weights, at most {MAX_POLICY_BYTES} are taken')
+def seal(run: int, version: int, data: bytes, key: bytes | None) -> PolicyWeights:
+    """A policy's file as a message, with its checksum and, where the team has a key, its signature."""
+    return sign(PolicyWeights(run, version, sha256(data), data), key)
+
+
+def check_size(size: int) -> None:
+    """Refuses weights of so many bytes where that is more than any policy has; to be asked before they are copied."""
+    if size > MAX_POLICY_BYTES:
+        raise Refused(Refused.OVERSIZED, f'{size} bytes of weights, at most {MAX_POLICY_BYTES} are taken')
+
+
+def open_weights(weights: PolicyWeights, key: bytes | None) -> Policy:
+    """The policy in a message. Raises Refused if it is too large, not signed with the team's key, damaged or something else."""
+    check_size(len(weights.data))
+    check_signature(weights, key)
     if sha256(weights.data) != weights.sha256:
         raise Refused(Refused.CORRUPT, f'the checksum of policy version {weights.version} does not match')
     return decode_policy(weights.data)

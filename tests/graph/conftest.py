@@ -30,8 +30,8 @@ def make_graph(domain):
     """Makes `Graph`s and stops whatever is left of them."""
     graphs: list[Graph] = []
 
-    def make(path: Path, values: dict, namespace: str = '') -> Graph:
-        graphs.append(Graph(path, values, namespace))
+    def make(path: Path, values: dict, namespace: str = '', key_file: str = '') -> Graph:
+        graphs.append(Graph(path, values, namespace, key_file))
         return graphs[-1]
 
     yield make

@@ -14,6 +14,7 @@ from typing import Callable
 
 import rclpy
 from dae_ros_msgs.msg import TrainingStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 
 from dae_ros import config
@@ -39,13 +40,14 @@ SMALL = {'task': 'navigation', 'num_agents': 3, 'num_worlds': 8, 'num_steps': 25
 class Graph:
     """Node processes of one run, started one by one in the order a test wants."""
 
-    def __init__(self, path: Path, values: dict, namespace: str = ''):
+    def __init__(self, path: Path, values: dict, namespace: str = '', key_file: str = ''):
         settings = config.from_flat(values)
         self.folder = RunFolder(path, settings)
         self._namespace = namespace
-        self.processes = {process.name: process for process in training_graph(settings, self.folder)}
+        self.processes = {process.name: process for process in training_graph(settings, self.folder, key_file)}
         self._codes: dict[str, int] = {}
         self.pids: dict[str, int] = {}
+        self.prefixes: dict[str, list[str]] = {}  # of commands, by node
         self._supervisor = Supervisor(path / 'logs', self._codes.__setitem__)
 
     @property
@@ -55,7 +57,7 @@ class Graph:
     def start(self, *names: str) -> None:
         for name in names:
             process = self.processes[name]
-            command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
+            command = [*self.prefixes.get(name, ()), sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
                        *process.arguments(self.folder.settings_file, self._namespace)]
             self.pids[name] = self._supervisor.start(name, command, os.environ)
 
@@ -184,3 +186,18 @@ class Listener:
             self._holds_within(ANSWER_TIMEOUT, lambda: any(future.done() for future in futures))
         self.node.destroy_client(client)
         return next(future.result() for future in futures if future.done())
+
+
+class Refusals:
+    """How many messages each node says it refused, from /diagnostics."""
+
+    def __init__(self, listener: Listener):
+        self.counted: dict[tuple[str, str, str], int] = {}  # by node, topic and reason
+        listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._hear, qos.EVENTS)
+
+    def _hear(self, report: DiagnosticArray) -> None:
+        for status in report.status:
+            for entry in status.values:
+                if entry.key.startswith('refused '):
+                    _, topic, reason = entry.key.split()
+                    self.counted[status.name, topic, reason] = int(entry.value)

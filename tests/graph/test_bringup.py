@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import select
 import signal
+import time
+from pathlib import Path
 
 import pytest
 from harness import SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of, processes_naming
@@ -110,3 +112,35 @@ def wait_until_gone(pid: int) -> None:
         return
     assert select.select([descriptor], [], [], TIMEOUT)[0], f'process {pid} is still there'
     os.close(descriptor)
+
+
+def catches_interrupts(process) -> bool:
+    """Whether a process has come so far as to handle SIGTERM itself."""
+    status = dict(line.split(':', 1) for line in (Path('/proc') / str(process.pid) / 'status').read_text().splitlines())
+    return bool(int(status['SigCgt'], 16) >> signal.SIGTERM - 1 & 1)
+
+
+MOMENTS = {
+    'as soon as it can hear': catches_interrupts,
+    'while nodes are started': lambda process: processes_naming('__node:=agent_0'),
+    'when the last node has begun': lambda process: processes_naming('__node:=trainer'),
+}
+
+
+@pytest.mark.parametrize('times', [1, 2], ids=['once', 'twice at once'])
+@pytest.mark.parametrize('moment', MOMENTS)
+def test_ctrl_c_at_any_time_stops_every_process_without_a_traceback(moment, times, domain, tmp_path):
+    process = bringup(tmp_path / 'run', LONG)
+    try:
+        while not MOMENTS[moment](process):
+            assert process.poll() is None
+            time.sleep(0.005)
+        for _ in range(times):
+            process.send_signal(signal.SIGINT)
+        code, output, errors = finish(process)
+    finally:
+        process.kill()
+    logs = [path.read_text() for path in (tmp_path / 'run' / 'logs').glob('*')]
+    assert code == 130 and errors.strip().splitlines()[-1] == 'stopped; every process is down'
+    assert not any('Traceback' in text for text in (output, errors, *logs)), [output, errors, *logs]
+    assert not processes_naming(str(tmp_path))

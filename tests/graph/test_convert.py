@@ -7,10 +7,12 @@ from array import array
 import numpy as np
 import pytest
 from dae_ros_msgs import msg
+from hypothesis import example, given, settings, strategies
 
 from dae_ros.errors import Refused
 from dae_ros.ros import convert
 from dae_ros.types import Action, JointState, Observation, PolicyWeights, RolloutRequest, SharedReward, Stamp
+from dae_ros.weights.codec import MAX_POLICY_BYTES
 
 STAMP = Stamp(run=7, rollout=3, attempt=1, step=24)
 RNG = np.random.default_rng(0)
@@ -46,7 +48,7 @@ def test_every_kind_of_datum_survives_the_trip_through_its_message():
     same(convert.shared_reward(convert.shared_reward_message(reward)), reward)
     request = RolloutRequest(7, 3, 1, 5, 2**63, 25, True)
     same(convert.rollout_request(convert.rollout_request_message(request)), request)
-    weights = PolicyWeights(7, 5, 'ab', b'\x00\xff1')
+    weights = PolicyWeights(7, 5, 'ab', b'\x00\xff1', 'cd')
     same(convert.policy_weights(convert.policy_weights_message(weights)), weights)
 
 
@@ -78,3 +80,48 @@ def test_an_empty_message_of_any_kind_is_refused_or_empty_but_never_a_crash():
             getattr(convert, lower)(getattr(msg, name)())
         except Refused:
             pass
+
+
+KINDS = {'observation': msg.Observation, 'action': msg.Action, 'joint_state': msg.JointState, 'shared_reward': msg.SharedReward,
+         'rollout_request': msg.RolloutRequest, 'policy_weights': msg.PolicyWeights}
+SIZES = strategies.sampled_from([0, 1, 2, 3, 255, 2**16, 2**31, 2**32 - 1])
+
+
+@strategies.composite
+def any_messages(draw):
+    """A kind of message and one of that kind, with any sizes and any values, often such that some of them fit."""
+    name = draw(strategies.sampled_from(list(KINDS)))
+    message = KINDS[name]()
+    small = draw(strategies.lists(strategies.integers(0, 3), min_size=4, max_size=4))
+    for number, (field, kind) in enumerate(message.get_fields_and_field_types().items()):
+        value = getattr(message, field)
+        if isinstance(value, array):
+            length = draw(strategies.sampled_from([0, *small, small[0] * small[1], small[0] * small[1] * small[2]]))
+            setattr(message, field, array(value.typecode, draw(strategies.binary(min_size=length * value.itemsize,
+                                                                                 max_size=length * value.itemsize))))
+        elif kind == 'uint32':
+            setattr(message, field, draw(strategies.sampled_from(small) | SIZES))
+        elif kind == 'string':
+            setattr(message, field, draw(strategies.text(max_size=70)))
+    return name, message
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(any_messages())
+@example(('joint_state', msg.JointState(num_agents=2**32 - 1, observation_size=2**32 - 1)))
+def test_any_message_becomes_arrays_of_the_sizes_it_says_or_is_refused(named):
+    name, message = named
+    try:
+        datum = getattr(convert, name)(message)
+    except Refused as refusal:
+        assert refusal.reason in (Refused.WRONG_SHAPE, Refused.OUT_OF_RANGE)
+    else:
+        assert all(part.size <= 81 for part in datum if isinstance(part, np.ndarray))
+
+
+def test_weights_larger_than_any_policy_are_refused_before_they_are_copied(monkeypatch):
+    message = msg.PolicyWeights(data=array('B', bytes(MAX_POLICY_BYTES + 1)))
+    monkeypatch.setattr(convert, 'bytes', lambda _: pytest.fail('copied'), raising=False)
+    with pytest.raises(Refused) as refusal:
+        convert.policy_weights(message)
+    assert refusal.value.reason == Refused.OVERSIZED

@@ -47,6 +47,9 @@ def test_an_unknown_key_in_a_parameter_file_is_an_error_too(domain, tmp_path):
     ('world', 'task:=soccer', "unknown task 'soccer'"),
     ('world', 'group:=1', 'group must lie in 0 .. 0 where world_groups is 1, not 1'),
     ('agent', 'group:=2', 'group must lie in 0 .. 0 where world_groups is 1, not 2'),
+    ('agent', 'key_file:=missing.key', 'cannot read key_file missing.key: No such file or directory'),
+    ('parameter_server', 'key_file:=/dev/null', 'key_file /dev/null must be a file of 32 to 4096 bytes that nobody can guess'),
+    ('trainer', 'key_file:=/dev/null', 'key_file /dev/null must be a file of 32 to 4096 bytes that nobody can guess'),
     ('trainer', 'world_groups:=3', 'num_worlds = 128 worlds cannot be split into world_groups = 3 groups of equal size'),
 ])
 def test_a_wrong_value_is_one_sentence(node, override, sentence, domain):
