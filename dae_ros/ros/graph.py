@@ -12,6 +12,8 @@ from dae_ros.errors import SettingsError
 from dae_ros.run_folder import RunFolder
 from dae_ros.worlds import world_spec
 
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+
 
 class NodeProcess(NamedTuple):
     """One node in a process of its own."""
@@ -83,6 +85,15 @@ def read_settings(task_file: Path | None, overrides: Iterable[str]) -> Settings:
 
 def node_environment() -> dict[str, str]:
     """Environment variables for the nodes where the user has set none: this host only, and quick discovery."""
-    defaults = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-                'FASTRTPS_DEFAULT_PROFILES_FILE': str((shipped_config() / 'fastdds.xml').resolve())}
+    defaults = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', _PROFILES: _profiles('fastdds.xml')}
     return {name: os.environ.get(name, value) for name, value in defaults.items()}
+
+
+def acknowledging_environment() -> dict[str, str]:
+    """Environment variables for a node that waits until its messages are acknowledged, which otherwise takes seconds."""
+    ours = os.environ.get(_PROFILES) in (None, _profiles('fastdds.xml'))
+    return {_PROFILES: _profiles('fastdds_player.xml')} if ours else {}
+
+
+def _profiles(name: str) -> str:
+    return str((shipped_config() / name).resolve())

@@ -51,7 +51,7 @@ def team_topics(num_agents: int, world_groups: int, everything: bool) -> list[Re
 def as_written(topic: RecordedTopic, full_name: str) -> Topic:
     """The topic for the bag."""
     kind = f'{_package(topic.kind)}/msg/{topic.kind.__name__}'
-    definition = _definition(topic.kind)
+    definition = definition_of(topic.kind)
     return Topic(full_name, kind, definition, rihs01(kind, 'ros2msg', definition), _qos(topic.offered))
 
 
@@ -59,7 +59,7 @@ def _package(kind: type) -> str:
     return kind.__module__.split('.')[0]
 
 
-def _definition(kind: type) -> str:
+def definition_of(kind: type) -> str:
     """The message's file, comments and all, and those of the messages within it, as rosbag2 puts them together."""
     parts, wanted = [], [f'{_package(kind)}/{kind.__name__}']
     for name in wanted:
