@@ -174,7 +174,8 @@ def test_a_run_may_begin_with_reward_networks_that_learnt_from_a_bag_of_its_own_
     with pytest.raises(run.Stopped):
         run.run(tmp_path / 'run', settings(total_steps=32, num_worlds=8), after(4), pretrained=80)
     for name, frozen in (('run', False), ('frozen', True)):
-        run.run(tmp_path / name, settings(total_steps=32, num_worlds=8, **{'reward_network.freeze': frozen}), never, pretrained=80)
+        values = {'total_steps': 32, 'num_worlds': 8, 'reward_network.freeze': frozen}
+        run.run(tmp_path / name, settings(**values), never, pretrained=80)
     file, = tmp_path.glob('pretrained/*/reward.safetensors')
     before = file.read_bytes()
     run.run(tmp_path / 'other', settings(total_steps=32, num_worlds=8, seed=2), never, pretrained=80)
