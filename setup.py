@@ -3,7 +3,7 @@ from glob import glob
 
 from setuptools import find_packages, setup
 
-EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'recorder', 'train_reward', 'trainer', 'world')
+EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'player', 'recorder', 'replay_trainer', 'train_reward', 'trainer', 'world')
 
 setup(
     name='dae_ros',

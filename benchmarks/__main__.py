@@ -1,7 +1,7 @@
 """make bench: what we reach on this machine; kept in benchmarks/results.json and drawn in docs/.
 
 Parts: training (one process, with its phases), graph (beside the single process), learner (arithmetic beside the matrix
-peak), worlds (simulators), inference (one robot), and scale (as the work grows), which takes long and must be named.
+peak), worlds (simulators), inference (one robot); scale (as the work grows) and bags, which take long and must be named.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from benchmarks import inference, learner, phases, scale, worlds
+from benchmarks import bags, inference, learner, phases, scale, worlds
 from benchmarks.machine import QUIET, ROOT, Bystanders, description
 from benchmarks.results import merge
 from dae_ros import config
@@ -67,8 +67,8 @@ def one_robot(rounds: int) -> dict[str, float]:
 
 PARTS: dict[str, Callable[[int], Any]] = {
     'training': training, 'graph': graph, 'learner': lambda rounds: learner.measure(repeats=rounds + 2), 'worlds': simulators,
-    'inference': one_robot, 'scale': lambda rounds: scale.measure()}
-UNASKED = tuple(name for name in PARTS if name != 'scale')
+    'inference': one_robot, 'scale': lambda rounds: scale.measure(), 'bags': bags.measure}
+UNASKED = tuple(name for name in PARTS if name not in ('scale', 'bags'))
 
 
 def plot(found: dict[str, dict[str, float]]) -> None:
@@ -98,7 +98,7 @@ PLOTS: dict[str, Callable[[Any], None]] = {'training': plot, 'scale': scale.plot
 def main() -> None:
     parser = argparse.ArgumentParser(prog='make bench', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('parts', nargs='*', metavar='part',
-                        help=f'which of {", ".join(PARTS)}; without any, all but scale')
+                        help=f'which of {", ".join(PARTS)}; without any, all but scale and bags')
     parser.add_argument('--rounds', type=int, default=3, help='turns of each training, graph and single process')
     options = parser.parse_args()
     unknown = set(options.parts) - set(PARTS)

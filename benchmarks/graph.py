@@ -21,17 +21,19 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Sequence
+from typing import Callable, Sequence
 
 import rclpy
 from dae_ros_msgs.msg import TrainingStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
+from std_srvs.srv import Trigger
 
 from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.report.metrics import STEPS, read_metrics
 from dae_ros.ros import names, qos
-from dae_ros.ros.graph import node_environment, training_graph
+from dae_ros.ros.graph import NodeProcess, node_environment, training_graph
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 
@@ -45,15 +47,16 @@ def cpu_seconds(process: int) -> float:
     return time.clock_gettime(~process << 3 | 2)  # the clock that clock_getcpuclockid(3) gives
 
 
-def run_graph(settings: Settings, path: Path, updates: int) -> dict[str, float]:
-    """Trains over the graph for `updates` updates; CPU seconds per tick while collecting, by node."""
+def run_graph(settings: Settings, path: Path, updates: int, bag: Path | None = None) -> dict[str, float]:
+    """Trains over the graph for `updates` updates, recorded into `bag` if there is one; CPU seconds per tick while collecting,
+    by node. The training begins when the recorder, which nobody waits for, has found all nodes."""
     folder = RunFolder(path, settings)
     codes: dict[str, int] = {}
     supervisor = Supervisor(path / 'logs', codes.__setitem__)
     processes: dict[str, int] = {}
     used: Counter[str] = Counter()
     before: dict[str, float] = {}
-    rollouts, newest = 0, 0
+    rollouts, newest, recorder = 0, 0, ''
 
     def hear(status: TrainingStatus) -> None:
         nonlocal before, newest, rollouts
@@ -66,21 +69,42 @@ def run_graph(settings: Settings, path: Path, updates: int) -> dict[str, float]:
             rollouts += 1
         before = now if status.state == TrainingStatus.COLLECTING and newest >= WARM_UP else {}
 
+    def diagnosed(report: DiagnosticArray) -> None:
+        nonlocal recorder
+        recorder = next((status.message for status in report.status if status.name == '/recorder'), recorder)
+
+    def spin_until(condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + TIMEOUT
+        while not condition():
+            if codes or time.monotonic() > deadline:
+                raise RuntimeError(f'the graph stood still, exit codes {codes}; its logs are in {path / "logs"}')
+            executor.spin_once(timeout_sec=1.0)
+
+    def call(name: str) -> None:
+        client = node.create_client(Trigger, name)
+        spin_until(client.service_is_ready)
+        spin_until(client.call_async(Trigger.Request()).done)
+
     rclpy.init(args=[])
     node = rclpy.create_node('benchmark', start_parameter_services=False)
     node.create_subscription(TrainingStatus, names.TRAINING_STATUS, hear, qos.LATCHED_INPUT)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        for process in training_graph(settings, folder):
+        nodes = {process.name: process for process in training_graph(settings, folder)}
+        if bag is not None:
+            nodes = {'trainer': nodes.pop('trainer'), 'recorder': NodeProcess('recorder', 'recorder', {'bag': str(bag)}), **nodes}
+            node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, diagnosed, qos.EVENTS)
+        for process in nodes.values():
             command = [sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
                        *process.arguments(folder.settings_file, '')]
             processes[process.name] = supervisor.start(process.name, command, os.environ)
-        deadline = time.monotonic() + TIMEOUT
-        while newest < updates:
-            if codes or time.monotonic() > deadline:
-                raise RuntimeError(f'the graph stood still, exit codes {codes}; its logs are in {path / "logs"}')
-            executor.spin_once(timeout_sec=1.0)
+            if bag is not None and process.name == 'trainer':
+                call(names.PAUSE)
+        if bag is not None:
+            spin_until(lambda: recorder == 'recording')
+            call(names.RESUME)
+        spin_until(lambda: newest >= updates)
     finally:
         supervisor.stop()
         rclpy.try_shutdown()

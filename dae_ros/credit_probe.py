@@ -12,9 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from dae_ros import draws
+from dae_ros.config import TaskSettings
+from dae_ros.errors import SettingsError
 from dae_ros.learning.policy import Policy
 from dae_ros.rollout.in_process import InProcessCollector
 from dae_ros.types import RolloutRequest, Trajectory
+from dae_ros.worlds import BUILT_IN, make_worlds, side_by_side
 from dae_ros.worlds.base import JointObservation, Transition, Worlds
 from dae_ros.worlds.synchronous import SynchronousWorlds
 
@@ -48,6 +51,27 @@ def probe(worlds: SynchronousWorlds, policy: Policy, expected_rewards: Callable[
                              num_steps=num_steps, greedy=False)
     trajectory = InProcessCollector(recorder).collect(request, policy)
     return Probe(trajectory, recorder.expected_rewards(trajectory), expected_rewards(trajectory))
+
+
+def recorded_expected_rewards(task: TaskSettings, num_worlds: int) -> Callable[[RolloutRequest, int, Trajectory], np.ndarray]:
+    """A function of a recorded rollout's request, group and trajectory: the true E over a_i ~ pi_i of its rewards, [T, W, N].
+
+    The rollout is simulated again with the recorded actions. Raises SettingsError if the task is not built in, or, from the
+    function, if the simulator pays other rewards than were recorded.
+    """
+    if task.task not in BUILT_IN:
+        raise SettingsError(f'the truth about E[r] is known of {", ".join(BUILT_IN)}, not of {task.task}')
+    recorder = AlternativesRecorder(make_worlds(side_by_side(task, num_worlds)))
+
+    def expected_rewards(request: RolloutRequest, group: int, trajectory: Trajectory) -> np.ndarray:
+        fits = recorder.reset(draws.group_seed(request.seed, group), request.rollout).state.shape == trajectory.states[0].shape
+        if not fits or any(not np.array_equal(recorder.step(actions).reward, rewards)
+                           for actions, rewards in zip(trajectory.actions, trajectory.rewards)):
+            raise SettingsError(f'rollout {request.rollout} was not played in this task: the simulator pays other rewards than '
+                                'were recorded')
+        return recorder.expected_rewards(trajectory)
+
+    return expected_rewards
 
 
 def accuracy(rewards: np.ndarray, expected: np.ndarray, predicted: np.ndarray) -> Accuracy:

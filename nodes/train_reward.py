@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import sys
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from dae_ros import config
 from dae_ros.command import run_command
-from dae_ros.config import SETTINGS, RewardTrainingSettings, declarations
+from dae_ros.config import SETTINGS, RewardTrainingSettings, TaskSettings, declarations
 from dae_ros.errors import DaeRosError
 from dae_ros.files import write_atomically
 from dae_ros.replay.dataset import Dataset
@@ -37,6 +38,9 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
                         help='bags (folders or files) and glob patterns')
     parser.add_argument('--output', type=Path, default=Path('runs/reward_network.safetensors'),
                         help='the file to write; the report goes to a folder beside it (default %(default)s)')
+    parser.add_argument('--task', type=Path, metavar='FILE',
+                        help='task file, or settings.yaml of the run, that was recorded: its simulator then tells the true E[r], '
+                             'and the report how far from it the predictions are')
     parser.add_argument('-p', '--parameter', action='append', default=[], metavar='NAME:=VALUE', help='change a setting')
     return parser.parse_args(arguments)
 
@@ -51,8 +55,14 @@ def read_settings(overrides: list[str]) -> tuple[config.Settings, RewardTraining
     return config.from_flat({name: value for name, value in values.items() if name in SHARED}), RewardTrainingSettings(**own)
 
 
+def read_task(path: Path) -> TaskSettings:
+    """The task that a file of settings names. Raises SettingsError."""
+    return config.from_flat(config.load_task_file(path)).task
+
+
 def train(dataset: Dataset, arguments: argparse.Namespace, console: Console) -> None:
     """Trains, writes file and report, and says what came of it. Raises DaeRosError."""
+    from dae_ros.credit_probe import accuracy, recorded_expected_rewards
     from dae_ros.replay.reward_training import RewardTraining  # torch takes seconds to load, and a wrong setting none
     from dae_ros.report.reward_training import write_report
 
@@ -66,6 +76,7 @@ def train(dataset: Dataset, arguments: argparse.Namespace, console: Console) -> 
         training = RewardTraining(dataset, settings, own,
                                   lambda done, total: progress.update(bar, completed=done, total=total or None))
         try:
+            truth = recorded_expected_rewards(read_task(arguments.task), dataset.num_worlds) if arguments.task else None
             baseline, skipped, epochs = training.baseline, dataset.describe_skipped(), []
             say(f'{dataset.rollouts:,} rollouts, {dataset.environment_steps:,} environment steps, {baseline.episodes:,} episodes '
                 f'with {baseline.held_out_episodes:,} held out{skipped and f"; skipped: {skipped}"}')
@@ -74,7 +85,7 @@ def train(dataset: Dataset, arguments: argparse.Namespace, console: Console) -> 
                 progress.update(bar, description=f'epoch {epoch.number + 1}')
                 say(f'epoch {epoch.number}: held-out error {epoch.held_out_error:.4g}, that of the mean reward is '
                     f'{baseline.held_out_error:.4g}{" (best)" if epoch.best else ""}')
-            data, held_out = training.file(), training.held_out()
+            data, held_out = training.file(), training.held_out(truth)
         finally:
             training.close()
     best = min(epochs, key=lambda epoch: epoch.held_out_error)
@@ -85,11 +96,16 @@ def train(dataset: Dataset, arguments: argparse.Namespace, console: Console) -> 
              'mean_reward_error': baseline.held_out_error, 'held_out_error': best.held_out_error, 'times_better': times,
              'best_epoch': best.number, 'epochs': [epoch._asdict() for epoch in epochs], 'sha256': sha256(data),
              'settings': {**dataclasses.asdict(own), **used}}
+    if truth is not None:
+        known = accuracy(held_out.rewards, held_out.true_expected, held_out.expected)
+        facts['expected_reward'] = {name: value if math.isfinite(value) else None for name, value in known._asdict().items()}
+        say(f'E[r] on held-out steps: root mean square error {known.error:.3g}, {100 * known.explained:.1f} % of its variance '
+            f'and {100 * known.credit_explained:.1f} % of the credit explained')
     report = arguments.output.with_suffix('')
     try:
         report.mkdir(parents=True, exist_ok=True)
         write_atomically(arguments.output, data)
-        write_report(report, facts, [epoch.held_out_error for epoch in epochs], baseline.held_out_error, *held_out)
+        write_report(report, facts, [epoch.held_out_error for epoch in epochs], baseline.held_out_error, held_out)
     except OSError as error:
         raise DaeRosError(f'cannot write {arguments.output}: {error.strerror}') from error
     say(f'{arguments.output}, SHA-256 {facts["sha256"]}; report in {report}')
@@ -100,6 +116,8 @@ def main(args: list[str] | None = None) -> int:
 
     def act() -> int:
         read_settings(arguments.parameter)
+        if arguments.task:
+            read_task(arguments.task)
         train(Dataset(*arguments.bag), arguments, Console(highlight=False))
         return 0
 

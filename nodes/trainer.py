@@ -37,6 +37,7 @@ from dae_ros.ros.node import TeamNode, run
 from dae_ros.ros.trust import team_key
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
+from dae_ros.types import RolloutRequest, Trajectory
 from dae_ros.weights.codec import encode_policy, seal
 from dae_ros.worlds import world_spec
 
@@ -53,31 +54,85 @@ class GroupInputs(NamedTuple):
     actions: list[Subscription]  # of each robot
 
 
-class TrainerNode(TeamNode):
-    """Wires a `Training` and its `GroupedAssembler` to their topics. Learning happens in the callback of the last datum."""
+class TrainingNode(TeamNode):
+    """A `Training` that sends out its policy and its status. Subclasses say where its rollouts come from."""
 
-    def __init__(self):
-        super().__init__('trainer', declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings,
-                                                 TrainerSettings, TeamKey))
+    def __init__(self, name: str):
+        super().__init__(name, declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings, TrainerSettings,
+                                            TeamKey))
         folder = self.settings.pop('run_folder')
         self._key = team_key(self, self.settings.pop('key_file'))
         settings = from_flat(self.settings)
-        task = settings.task
-        spec = world_spec(task)
-        folder = Path(folder or f'runs/{task.task.replace(":", "_")}_n{spec.num_agents}_seed{settings.run.seed}')
+        spec = world_spec(settings.task)
+        folder = Path(folder or f'runs/{settings.task.task.replace(":", "_")}_n{spec.num_agents}_seed{settings.run.seed}')
         self._folder = RunFolder(folder, settings)
         self._training = Training(settings, spec, self._folder)
-        self._assembler = GroupedAssembler(spec, task.worlds_per_group, task.world_groups)
         self._state = Status.WAITING
-        self._paused = False
-
         self._policy_update = self.publisher(msg.PolicyWeights, names.POLICY_UPDATE, qos.LATCHED)
-        self._request = self.publisher(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED)
         self._status = self.publisher(Status, names.TRAINING_STATUS, qos.LATCHED)
+        self.create_service(Trigger, names.SAVE, self._on_save)
+
+    def _learn(self, trajectory: Trajectory) -> None:
+        """Takes in the rollout asked for last."""
+        if not self._training.evaluating:
+            self._announce(Status.LEARNING, '')
+        version = self._training.policy_version
+        self._training.consume(trajectory)
+        if self._training.policy_version != version:
+            self._publish_policy()
+
+    def _request_rollout(self) -> RolloutRequest:
+        """The rollout wanted now."""
+        request = self._training.request()
+        self._announce(Status.EVALUATING if self._training.evaluating else Status.COLLECTING, '')
+        return request
+
+    def _finish(self) -> None:
+        self._announce(Status.EVALUATING, 'drawing the report')
+        write_report(self._training, self._folder)
+        self._announce(Status.FINISHED, '')
+        self._status.wait_for_all_acked(FAREWELL)
+        self.done = True
+
+    # What others see.
+
+    def _publish_policy(self) -> None:
+        if not self.context.ok():
+            raise ExternalShutdownException()
+        training = self._training
+        weights = seal(training.run, training.policy_version, encode_policy(training.policy), self._key)
+        self._policy_update.publish(convert.policy_weights_message(weights))
+
+    def _announce(self, state: int, detail: str) -> None:
+        training = self._training
+        self._state = state
+        self._status.publish(Status(run=training.run, state=state, detail=detail,
+                                    environment_steps=training.environment_steps, total_steps=training.total_steps,
+                                    policy_version=training.policy_version, mean_return=training.mean_return,
+                                    steps_per_second=training.steps_per_second))
+
+    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._training.save()
+        response.success, response.message = True, f'saved in {self._folder.checkpoints}'
+        return response
+
+    def close(self) -> None:
+        self._training.close()
+
+
+class TrainerNode(TrainingNode):
+    """Wires a `GroupedAssembler` to its topics. Learning happens in the callback of the last datum."""
+
+    def __init__(self):
+        super().__init__('trainer')
+        training, settings = self._training, self._training.settings
+        task = settings.task
+        self._assembler = GroupedAssembler(training.spec, task.worlds_per_group, task.world_groups)
+        self._paused = False
+        self._request = self.publisher(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED)
         self._groups = [self._listen_to_group(group) for group in range(task.world_groups)]
         self.create_service(Trigger, names.PAUSE, self._on_pause)
         self.create_service(Trigger, names.RESUME, self._on_resume)
-        self.create_service(Trigger, names.SAVE, self._on_save)
         self.listen(Status, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
         self._rival: Status | None = None  # of another trainer that is at work here
         self._answered = False  # whether anything has ever arrived
@@ -85,7 +140,7 @@ class TrainerNode(TeamNode):
         self._heard_at = 0.0
         self._silent_attempts = 0  # in a row
         # Seconds without a message after which a rollout is begun anew.
-        self._patience = SHORT_PATIENCE if self._training.attempt else settings.run.rollout_timeout
+        self._patience = SHORT_PATIENCE if training.attempt else settings.run.rollout_timeout
         self.every(min(SHORT_PATIENCE, settings.run.rollout_timeout) / 4, self._begin_anew_if_silent)
         self._publish_policy()
         self._advance()
@@ -138,10 +193,9 @@ class TrainerNode(TeamNode):
             self._ask()
 
     def _ask(self) -> None:
-        request = self._training.request()
+        request = self._request_rollout()
         self._assembler.begin(request)
         self._heard, self._heard_at = False, time.monotonic()
-        self._announce(Status.EVALUATING if self._training.evaluating else Status.COLLECTING, '')
         self._request.publish(convert.rollout_request_message(request))
 
     def _missing(self) -> list[str]:
@@ -163,13 +217,7 @@ class TrainerNode(TeamNode):
         if not self._assembler.complete:
             return
         self._patience, self._silent_attempts = self._training.settings.run.rollout_timeout, 0
-        trajectory = self._assembler.trajectory()
-        if not self._training.evaluating:
-            self._announce(Status.LEARNING, '')
-        version = self._training.policy_version
-        self._training.consume(trajectory)
-        if self._training.policy_version != version:
-            self._publish_policy()
+        self._learn(self._assembler.trajectory())
         self._advance()
 
     def _begin_anew_if_silent(self) -> None:
@@ -205,29 +253,7 @@ class TrainerNode(TeamNode):
             raise StalledError(f'another trainer is at work here: its run {rival.run:x} has {rival.environment_steps} of '
                                f'{rival.total_steps} steps. Start this one in a namespace of its own, or when that one is done')
 
-    def _finish(self) -> None:
-        self._announce(Status.EVALUATING, 'drawing the report')
-        write_report(self._training, self._folder)
-        self._announce(Status.FINISHED, '')
-        self._status.wait_for_all_acked(FAREWELL)
-        self.done = True
-
     # What others see.
-
-    def _publish_policy(self) -> None:
-        if not self.context.ok():
-            raise ExternalShutdownException()
-        training = self._training
-        weights = seal(training.run, training.policy_version, encode_policy(training.policy), self._key)
-        self._policy_update.publish(convert.policy_weights_message(weights))
-
-    def _announce(self, state: int, detail: str) -> None:
-        training = self._training
-        self._state = state
-        self._status.publish(Status(run=training.run, state=state, detail=detail,
-                                    environment_steps=training.environment_steps, total_steps=training.total_steps,
-                                    policy_version=training.policy_version, mean_return=training.mean_return,
-                                    steps_per_second=training.steps_per_second))
 
     def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._paused = True
@@ -239,11 +265,6 @@ class TrainerNode(TeamNode):
         self._paused = False
         if self._state == Status.PAUSED:
             self._advance()
-        return response
-
-    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._training.save()
-        response.success, response.message = True, f'saved in {self._folder.checkpoints}'
         return response
 
     def diagnose(self):
@@ -258,9 +279,6 @@ class TrainerNode(TeamNode):
             sentence = f'policy version {training.policy_version}'
         return sentence, {'run': f'{training.run:x}', 'environment steps': training.environment_steps,
                           'mean return': training.mean_return}
-
-    def close(self) -> None:
-        self._training.close()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -20,11 +20,13 @@ FOLDER = ROOT / 'config' / 'figures'
 EVERY_RUN = {'device': 'cpu', 'learner_threads': 1}
 SECONDS = 'seconds'
 EXACT = 'exact'  # true among a curve's settings: its runs are told the simulator's E[r]
+PRETRAINED = 'pretrained'  # among them too: steps of a team that has learnt nothing, from which its reward networks learn first
 METRICS = {'mean_return': 'mean return of an episode', 'advantage/deviation': 'standard deviation of the advantages',
            'reward_network/explained_variance': 'variance of the reward explained',
            'expected_reward/explained': 'variance of E[r] explained', 'credit/explained': 'credit explained',
            STEPS: 'environment steps', SECONDS: 'seconds of training, in one thread'}
 SHORT_STEPS = 200  # of each run
+SHORT_PRETRAINING = 400
 SHORT = {'num_worlds': 4, 'epochs': 1, 'reward_network.epochs': 1, 'evaluation_episodes': 8}
 
 
@@ -35,6 +37,7 @@ class Run:
     name: str
     settings: Settings
     exact: bool = False  # with the simulator's own E[r] in place of reward networks
+    pretrained: int = 0  # steps its reward networks learn from before it begins
 
     @property
     def seed(self) -> int:
@@ -97,7 +100,7 @@ class Figure:
     def run(self, team: Team, curve: str, seed: int, steps: int | None = None) -> Run:
         """The run behind one curve and seed; `steps` other than the team's make it a longer one."""
         changes = dict(self.curves[curve])
-        exact = changes.pop(EXACT, False)
+        exact, pretrained = bool(changes.pop(EXACT, False)), changes.pop(PRETRAINED, 0)
         values = {**_task_file(team.task), **EVERY_RUN, **(SHORT if self.short else {}), **changes,
                   'num_agents': team.num_agents, 'seed': seed, 'total_steps': steps or team.steps}
         try:
@@ -106,7 +109,9 @@ class Figure:
             raise SettingsError(f'curve {curve} of figure {self.name}: {error}') from error
         # Named after its settings, not after a figure or a curve, so that figures share it.
         different = ''.join(f'_{name}-{_text(config.flatten(settings)[name])}' for name in sorted(changes))
-        return Run(f'{team.task}_n{team.num_agents}{different}{f"_{EXACT}" if exact else ""}_seed{seed}', settings, bool(exact))
+        different += f'_{EXACT}' if exact else f'_{PRETRAINED}-{pretrained}' if pretrained else ''
+        return Run(f'{team.task}_n{team.num_agents}{different}_seed{seed}', settings, exact,
+                   min(pretrained, SHORT_PRETRAINING) if self.short else pretrained)
 
     def runs(self, team: Team, curve: str) -> list[Run]:
         """One for each seed."""

@@ -1,4 +1,5 @@
-"""python -m reproduce.run FOLDER SETTINGS [exact]: one training in this process, in one thread, resumed where it was interrupted.
+"""python -m reproduce.run FOLDER SETTINGS [exact] [pretrained=STEPS]: one training in this process, in one thread, resumed where
+it was interrupted.
 
 SETTINGS is a JSON object of settings by their names. The folder is a run's folder as bringup makes it, and holds beside it
 `finished_<steps>.json`, the facts of every end it came to, and credit/metrics.csv, how well its reward network tells credit.
@@ -32,7 +33,8 @@ from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
 from dae_ros.worlds import make_worlds
 from dae_ros.worlds.synchronous import SynchronousWorlds
-from reproduce.figures import EXACT
+from reproduce.figures import EXACT, PRETRAINED
+from reproduce.pretraining import pretrained_file
 from reproduce.records import finished_file
 
 NICENESS = 10  # whoever works on this machine comes first
@@ -43,8 +45,9 @@ class Stopped(Exception):
     """The run was asked to stop before its end; its checkpoint is written."""
 
 
-def run(path: Path, settings: Settings, stopping: Callable[[], bool], exact: bool = False) -> None:
+def run(path: Path, settings: Settings, stopping: Callable[[], bool], exact: bool = False, pretrained: int = 0) -> None:
     """Trains and evaluates in the folder `path` and writes its facts. exact: the simulator tells E[r], no network learns it.
+    pretrained: steps its reward networks learn from first.
 
     Raises Stopped once `stopping` holds, and RunFolderError if the folder is another run's or is in use.
     """
@@ -54,6 +57,13 @@ def run(path: Path, settings: Settings, stopping: Callable[[], bool], exact: boo
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise RunFolderError(f'{path} is being trained by another process') from error
+        if pretrained:
+            def check() -> None:
+                if stopping():
+                    raise Stopped
+
+            file = pretrained_file(path.parent, settings, pretrained, check)
+            settings = config.from_flat({'reward_network.path': str(file)}, settings)
         _train(path, settings, stopping, exact)
 
 
@@ -141,7 +151,7 @@ def main() -> None:
     try:
         # Without its parent nobody would stop it, and it would hold the lock.
         run(Path(sys.argv[1]), config.from_flat(json.loads(sys.argv[2])), lambda: bool(asked) or os.getppid() != parent,
-            exact=sys.argv[3:] == [EXACT])
+            EXACT in sys.argv[3:], sum(int(text.removeprefix(f'{PRETRAINED}=')) for text in sys.argv[3:] if text != EXACT))
     except Stopped:
         sys.exit('stopped; it goes on from here when it is started again')
     except DaeRosError as error:

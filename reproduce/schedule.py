@@ -13,7 +13,7 @@ from typing import Sequence
 
 from benchmarks.machine import ROOT
 from dae_ros import config
-from reproduce.figures import EXACT, Run
+from reproduce.figures import EXACT, PRETRAINED, Run
 from reproduce.progress import Progress
 from reproduce.records import Records
 
@@ -91,7 +91,7 @@ def _start(run: Run, records: Records) -> subprocess.Popen:
     with open(records.log_file(run), 'w') as log:
         # A session of its own: Ctrl-C reaches this process alone, which then stops the runs.
         command = [sys.executable, '-m', 'reproduce.run', path.absolute(), json.dumps(config.flatten(run.settings)),
-                   *([EXACT] if run.exact else [])]
+                   *([EXACT] if run.exact else []), *([f'{PRETRAINED}={run.pretrained}'] if run.pretrained else [])]
         return subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
 
 

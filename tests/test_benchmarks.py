@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import results
+from benchmarks import bags, results
 from benchmarks.machine import ROOT, Bystanders
 from benchmarks.peers import contender, environments, match
 from benchmarks.peers.contender import Block, Contender, ContenderFailed, Running
@@ -18,6 +18,7 @@ from benchmarks.peers.match import Comparison, Match
 from benchmarks.peers.outcome import Row, disturbance, outcome
 from benchmarks.peers.plot import plot
 from dae_ros import config
+from dae_ros.replay.played import write_rollouts
 
 
 def row(name, *speeds, bystanders=0.0):
@@ -168,3 +169,30 @@ def test_peers_do_not_see_our_own_packages(monkeypatch):
     monkeypatch.setenv('PYTHONPATH', str(ROOT))
     assert 'PYTHONPATH' not in environments.clean_environment()
     assert Path(sys.prefix).name not in environments.clean_environment().get('VIRTUAL_ENV', '')
+
+
+# What bags are measured with, in small.
+
+TEAM = {'task': 'matrix_game', 'num_agents': 2, 'num_steps': 4, 'num_worlds': 8}
+
+
+@pytest.fixture
+def bag(tmp_path):
+    write_rollouts(tmp_path / 'bag', bags.played(config.from_flat(TEAM), 320), bags.SCHEMAS)
+    return tmp_path / 'bag'
+
+
+def test_a_message_that_a_recording_lacks_is_counted(bag, tmp_path):
+    settings = config.from_flat({**TEAM, 'total_steps': 320})
+    everything = 10 * (1 + 5 + 4 + 2 * 4)
+    assert bags.lost(bag, settings) == (everything, 0)
+    assert bags.lost(bag, config.from_flat({'total_steps': 352}, settings)) == (everything, everything // 10)
+    played = list(bags.played(settings, 320))
+    write_rollouts(tmp_path / 'shorter', played[:-1], bags.SCHEMAS)
+    assert bags.lost(tmp_path / 'shorter', settings) == (everything * 9 // 10, everything // 10)
+
+
+def test_bags_are_read_and_learnt_from_in_small(bag):
+    assert bags.reading(bag, 2) > 0
+    found = bags.learning(bag, config.from_flat({**TEAM, **bags.NETWORK, 'reward_network.hidden_size': 16}), max_epochs=2)
+    assert found['times_better'] == pytest.approx(found['mean_reward_error'] / found['held_out_error'])

@@ -16,8 +16,9 @@ from rosbags.rosbag2 import Reader
 from dae_ros.errors import BagError
 from dae_ros.replay.dataset import Dataset
 from dae_ros.replay.gaps import Gaps
+from dae_ros.replay.played import write_rollouts
 from dae_ros.replay.recording import Recording, Topic
-from tests.bags import Team, as_message, typestore
+from tests.bags import SCHEMAS, Team, as_message, typestore
 
 QOS = Qos(QosHistory.KEEP_LAST, 1024, QosReliability.RELIABLE, QosDurability.VOLATILE, QosTime(0, 0), QosTime(0, 0),
           QosLiveliness.SYSTEM_DEFAULT, QosTime(0, 0), False)
@@ -109,9 +110,10 @@ def test_a_disk_that_is_full_ends_the_recording_with_one_sentence(storage, heard
 WRITING = '''
 import sys, time
 from pathlib import Path
+from dae_ros.replay.played import write_rollouts
 from dae_ros.replay.recording import Recording
 from tests.test_recording import serialized
-from tests.bags import Team
+from tests.bags import SCHEMAS, Team
 
 team = Team()
 topics, messages = serialized([datum for rollout in range(4) for datum in team.play(rollout)[1]])
@@ -170,3 +172,13 @@ def test_recording_keeps_up_with_any_team(heard, tmp_path):
         recording.write(topic, 10**18 + moment * 10**5, data)
     assert len(messages) * 20 / (time.process_time() - began) > 10_000
     recording.close()
+
+
+def test_rollouts_that_were_played_in_one_process_are_written_as_a_recorder_hears_them(played, tmp_path):
+    write_rollouts(tmp_path / 'bag', [(data[0], live) for live, data in played], SCHEMAS)
+    dataset = Dataset(tmp_path / 'bag')
+    rollouts = list(dataset.read())
+    assert same(played, (rollout.trajectory for rollout in rollouts)) and not dataset.skipped
+    assert [rollout.request for rollout in rollouts] == [data[0] for _, data in played]
+    with Reader(tmp_path / 'bag') as reader:
+        assert reader.message_count == sum(len(data) for _, data in played)

@@ -20,6 +20,8 @@ from scipy.stats import t as student
 from dae_ros import config
 from dae_ros.errors import RunFolderError, SettingsError
 from dae_ros.report.metrics import MetricsLog
+from dae_ros.run_folder import RunFolder
+from dae_ros.weights.codec import decode_reward_network
 from reproduce import figures, run, schedule
 from reproduce.curves import COLUMNS, POINTS, Curves
 from reproduce.figures import Run
@@ -165,6 +167,26 @@ def test_a_run_is_trained_by_one_process_at_a_time(tmp_path):
         return False
 
     run.run(tmp_path / 'run', settings(total_steps=8), again)
+
+
+def test_a_run_may_begin_with_reward_networks_that_learnt_from_a_bag_of_its_own_seed(tmp_path):
+    """They are trained once, and a run that is stopped meanwhile trains them again."""
+    with pytest.raises(run.Stopped):
+        run.run(tmp_path / 'run', settings(total_steps=32, num_worlds=8), after(4), pretrained=80)
+    for name, frozen in (('run', False), ('frozen', True)):
+        values = {'total_steps': 32, 'num_worlds': 8, 'reward_network.freeze': frozen}
+        run.run(tmp_path / name, settings(**values), never, pretrained=80)
+    file, = tmp_path.glob('pretrained/*/reward.safetensors')
+    before = file.read_bytes()
+    run.run(tmp_path / 'other', settings(total_steps=32, num_worlds=8, seed=2), never, pretrained=80)
+    other, = set(tmp_path.glob('pretrained/*/reward.safetensors')) - {file}
+    assert file.read_bytes() == before != other.read_bytes()
+    learnt = {name: RunFolder(tmp_path / name, config.from_flat(config.load_task_file(tmp_path / name / 'settings.yaml')))
+              .newest_checkpoint()[0] for name in ('run', 'frozen')}
+    for name, tensor in decode_reward_network(before)[0].items():
+        member, _, parameter = name.partition('.')
+        kept, moved = (learnt[run][f'reward_network.{member}.parameters.{parameter}'] for run in ('frozen', 'run'))
+        assert np.array_equal(kept, tensor) and not np.array_equal(moved, tensor)
 
 
 # Scheduling.
@@ -351,7 +373,7 @@ def test_csv_rows_are_few_and_the_longer_run_is_in_them_once(tmp_path):
 
 @pytest.mark.slow  # a process for each of some twenty runs
 def test_every_figure_is_trained_drawn_and_tabled_in_its_short_mode(tmp_path):
-    done = subprocess.run(reproduce(tmp_path), cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(reproduce(tmp_path), cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     text = (tmp_path / 'docs/results.md').read_text()
     for figure in figures.load(NAMES, short=True):

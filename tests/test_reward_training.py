@@ -9,11 +9,12 @@ from dae_ros_nodes import train_reward
 
 from dae_ros import config
 from dae_ros.config import RewardTrainingSettings
+from dae_ros.credit_probe import AlternativesRecorder, recorded_expected_rewards
 from dae_ros.errors import BagError, Refused, SettingsError
 from dae_ros.replay.dataset import Dataset
 from dae_ros.replay.reward_training import RewardTraining
 from dae_ros.report.metrics import read_metrics
-from dae_ros.rollout.in_process import train
+from dae_ros.rollout.in_process import InProcessCollector, train
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
 from dae_ros.weights.codec import decode_policy, decode_reward_network
@@ -192,6 +193,35 @@ def test_the_command_writes_the_network_and_a_report(bag, tmp_path, capsys):
     assert report['settings']['reward_network.hidden_size'] == 16
     assert (tmp_path / 'out/reward/report.png').read_bytes().startswith(b'\x89PNG')
     assert decode_reward_network(output.read_bytes())[1]['hidden_size'] == 16
+
+
+@pytest.mark.parametrize('values', [GAME, {'task': 'navigation', 'num_worlds': 4, 'num_steps': 25}], ids=['game', 'navigation'])
+def test_where_the_task_is_known_the_report_tells_the_error_of_the_expected_reward(values, tmp_path, capsys):
+    team, seen = Team(**values), []
+    for rollout in range(8):
+        seen += team.play(rollout)[1]
+    bag = write_bag(tmp_path / 'bag', seen)
+    (tmp_path / 'task.yaml').write_text(config.to_yaml(team.settings))
+    command = ['--bag', str(bag), '--output', str(tmp_path / 'reward.safetensors'), '-p', 'reward_network.hidden_size:=16',
+               '-p', 'max_epochs:=2', '-p', 'held_out:=0.2', '--task', str(tmp_path / 'task.yaml')]
+    assert train_reward.main(command) == 0
+    assert 'of its variance and' in capsys.readouterr().out
+    report = json.loads((tmp_path / 'reward/report.json').read_text())
+    assert report['expected_reward']['error'] > 0 and (tmp_path / 'reward/report.png').exists()
+    (tmp_path / 'task.yaml').write_text(config.to_yaml(config.from_flat({'task': 'formation'}, team.settings)))
+    assert train_reward.main(command) == 2
+    assert 'was not played in this task' in capsys.readouterr().err
+
+
+def test_the_true_expected_reward_of_a_recorded_rollout_is_the_one_it_was_played_with():
+    team = Team(task='navigation')
+    (trajectory, data), truth = team.play(3), recorded_expected_rewards(team.settings.task, 4)
+    alternatives = AlternativesRecorder(make_worlds(team.settings.task))
+    live = InProcessCollector(alternatives).collect(data[0], team._policy)
+    assert np.array_equal(truth(data[0], 0, trajectory), alternatives.expected_rewards(live))
+    assert truth(data[0], 0, trajectory).shape == (5, 4, 3)
+    with pytest.raises(SettingsError, match='known of navigation, .*, not of pettingzoo:'):
+        recorded_expected_rewards(config.from_flat({'task': 'pettingzoo:mpe2.simple_spread_v3'}).task, 4)
 
 
 @pytest.mark.parametrize('arguments, complaint', [

@@ -1,4 +1,4 @@
-"""Opens rosbag2 bags, MCAP or sqlite3, whole or left by a crash, and gives the messages that rollouts are made of."""
+"""Opens rosbag2 bags, MCAP or sqlite3, whole or left by a crash, and gives their messages in the order they were recorded."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from dae_ros.errors import BagError
 from dae_ros.replay import mcap
 from dae_ros.replay.cdr import MESSAGE_TYPES
-from dae_ros.replay.mcap import Message, decompressed, zstd
+from dae_ros.replay.mcap import Accept, Message, decompressed, zstd
 
 SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 MOST_BYTES = 2**30  # of a message that was compressed by itself
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
-_READ_ROWS = '''SELECT topics.name, topics.type, messages.timestamp, messages.data
+_READ_ROWS = '''SELECT topics.name, topics.type, messages.timestamp, messages.data, topics.offered_qos_profiles
                 FROM messages JOIN topics ON messages.topic_id = topics.id ORDER BY messages.id'''
 
 
@@ -42,16 +42,20 @@ def find_bags(*patterns: str | Path) -> list[Path]:
 class Bag:
     """One bag."""
 
-    def __init__(self, path: Path, damage: Counter[str]):
-        """`damage` is where what cannot be read of the bag is counted, by reason. BagError if there is nothing to read."""
+    def __init__(self, path: Path, damage: Counter[str], accept: Accept | None = None):
+        """`damage` is where what cannot be read of the bag is counted, by reason. BagError if there is nothing to read.
+
+        `accept` chooses the types, and may raise BagError; without it they are those that rollouts are made of.
+        """
         self._damage = damage
+        self._accept = accept or _wanted
         files = sorted(path.iterdir(), key=_natural) if path.is_dir() else [path]
         self._files = [file for file in files if file.name.endswith(SUFFIXES)]
         if not self._files:
             raise BagError(f'{path} is not a rosbag2 bag: expected {", ".join(SUFFIXES)}')
 
     def messages(self) -> Iterator[Message]:
-        """The messages of types in `MESSAGE_TYPES`, in the order they were recorded; a bag larger than memory streams.
+        """The wanted messages, in the order they were recorded; a bag larger than memory streams.
 
         Raises BagError, naming the bag, where it is not one, or where the messages are of another version than ours.
         """
@@ -74,7 +78,7 @@ class Bag:
                 self._damage[mcap.CORRUPT] += 1
         elif path.suffix == '.mcap':
             with open(path, 'rb') as file:
-                yield from self._unpacked(mcap.messages(file, size, _wanted, self._damage))
+                yield from self._unpacked(mcap.messages(file, size, self._accept, self._damage))
         else:
             yield from self._unpacked(self._rows(path))
 
@@ -82,7 +86,7 @@ class Bag:
         """A file that was compressed as a whole; sqlite3 needs it unpacked."""
         with zstd.open(path, 'rb') as file:
             if path.stem.endswith('.mcap'):
-                yield from self._unpacked(mcap.messages(file, mcap.LARGEST, _wanted, self._damage))
+                yield from self._unpacked(mcap.messages(file, mcap.LARGEST, self._accept, self._damage))
                 return
             with tempfile.NamedTemporaryFile(suffix='.db3') as unpacked:
                 shutil.copyfileobj(file, unpacked)
@@ -96,12 +100,12 @@ class Bag:
         begun = False
         try:
             with closing(sqlite3.connect(f'file:{quote(str(path.resolve()))}?mode={mode}', uri=True)) as database:
-                wanted = {name for name, *definition in _definitions(database) if _wanted(name, *definition)}
-                for topic, name, time, data in database.execute(_READ_ROWS):
+                wanted = {name for name, *definition in _definitions(database) if self._accept(name, *definition)}
+                for topic, name, time, data, qos in database.execute(_READ_ROWS):
                     begun = True
                     if name in wanted:
                         if isinstance(data, bytes) and isinstance(topic, str) and isinstance(time, int):
-                            yield Message(topic, name, time, memoryview(data))
+                            yield Message(topic, name, time, memoryview(data), str(qos))
                         else:
                             self._damage[mcap.CORRUPT] += 1
         except (sqlite3.Error, UnicodeDecodeError) as error:

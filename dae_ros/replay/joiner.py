@@ -14,8 +14,8 @@ from dae_ros.replay.mcap import Message
 from dae_ros.rollout.assembler import Assembler
 from dae_ros.types import Action, JointState, RolloutRequest, Trajectory, WorldSpec
 
-MOST_OPEN = 4        # rollouts of one group being joined at once: the one under way, its neighbours, other attempts
-MOST_REQUESTS = 256  # remembered for data that come later
+MOST_OPEN = 4         # rollouts of one group being joined at once: the one under way, its neighbours, other attempts
+MOST_REQUESTS = 8192  # remembered for data that come later
 INCOMPLETE = 'incomplete'
 
 _GROUP = re.compile(r'(.*?)/?group_(\d+)')
@@ -59,8 +59,9 @@ class _Part:
 class Joiner:
     """Takes in messages one by one. Those refused are counted in `skipped` by reason, and rollouts that stay `incomplete`."""
 
-    def __init__(self, skipped: Counter[str]):
+    def __init__(self, skipped: Counter[str], most_open: int = MOST_OPEN):
         self._skipped = skipped
+        self._most_open = most_open
         self._open: dict[tuple[str, int], dict[tuple[int, int, int], _Part]] = {}
         self._requests: dict[tuple[str, int, int, int], RolloutRequest] = {}
         self._done: set[tuple[str, int, int, int]] = set()
@@ -96,7 +97,7 @@ class Joiner:
         parts = self._open.setdefault((team, group), {})
         key = run, rollout, attempt
         if key not in parts:
-            if len(parts) == MOST_OPEN:
+            if len(parts) == self._most_open:
                 del parts[next(iter(parts))]
                 self._skipped[INCOMPLETE] += 1
             parts[key] = _Part()

@@ -28,6 +28,7 @@ _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05
 _RECORD = struct.Struct('<BQ')
 _MESSAGE_HEAD = struct.Struct('<HIQQ')
 _CHUNK_HEAD = struct.Struct('<QQQI')
+_QOS = 'offered_qos_profiles'
 
 
 class Message(NamedTuple):
@@ -37,6 +38,7 @@ class Message(NamedTuple):
     type: str
     time: int  # ns, when it was recorded
     data: memoryview
+    qos: str = ''  # the profiles its topic was offered with, as YAML
 
 
 Accept = Callable[[str, str, str], bool]
@@ -75,7 +77,7 @@ class _Channels:
         self._accept = accept
         self._damage = damage
         self._schemas: dict[int, tuple[str, str, str]] = {}
-        self._channels: dict[int, tuple[str, str] | None] = {}  # topic and type; None where they are not wanted
+        self._channels: dict[int, tuple[str, str, str] | None] = {}  # topic, type, QoS; None where they are not wanted
 
     def read(self, records: memoryview) -> Iterator[Message]:
         """The wanted messages among the records of a chunk."""
@@ -96,7 +98,8 @@ class _Channels:
                 channel, _, time, _ = _MESSAGE_HEAD.unpack_from(record)
                 known = self._channels[channel]
                 if known is not None:
-                    yield Message(*known, time, record[_MESSAGE_HEAD.size:])
+                    topic, kind, qos = known
+                    yield Message(topic, kind, time, record[_MESSAGE_HEAD.size:], qos)
             elif opcode == _SCHEMA:
                 (number,), rest = struct.unpack_from('<H', record), record[2:]
                 name, rest = _text(rest)
@@ -104,10 +107,11 @@ class _Channels:
                 self._schemas[number] = name, encoding, _text(rest)[0]
             elif opcode == _CHANNEL:
                 (number, schema), rest = struct.unpack_from('<HH', record), record[4:]
-                topic, _ = _text(rest)
+                topic, rest = _text(rest)
                 definition = self._schemas.get(schema, ('', '', ''))
                 if number not in self._channels:
-                    self._channels[number] = (topic, definition[0]) if self._accept(*definition) else None
+                    known = topic, definition[0], _map(_text(rest)[1]).get(_QOS, '')
+                    self._channels[number] = known if self._accept(*definition) else None
         except (struct.error, ValueError, KeyError):  # KeyError: the channel's record is lost
             self._damage[CORRUPT] += 1
 
@@ -118,6 +122,16 @@ def _text(data: memoryview) -> tuple[str, memoryview]:
     if length > len(data) - 4:
         raise ValueError('a text longer than its record')
     return bytes(data[4:4 + length]).decode(), data[4 + length:]
+
+
+def _map(data: memoryview) -> dict[str, str]:
+    """Texts by text, from a length in bytes and so many bytes of them."""
+    (length,) = struct.unpack_from('<I', data)
+    rest, found = data[4:4 + length], {}
+    while rest:
+        key, rest = _text(rest)
+        found[key], rest = _text(rest)
+    return found
 
 
 def _content(chunk: memoryview) -> memoryview:

@@ -25,7 +25,7 @@ from dae_ros.learning.networks import make_reward_network
 from dae_ros.learning.passes import Passes
 from dae_ros.replay.dataset import Dataset
 from dae_ros.replay.joiner import Rollout
-from dae_ros.types import Trajectory
+from dae_ros.types import RolloutRequest, Trajectory
 
 SHOWN = 4000  # held-out predictions kept for the report
 
@@ -48,11 +48,18 @@ class Baseline(NamedTuple):
 
 
 class HeldOut(NamedTuple):
-    """Predictions on held-out episodes."""
+    """Predictions on held-out episodes. E[r] is over a_i ~ pi_i; a credit is r - E[r]."""
 
-    rewards: np.ndarray    # [steps] the true ones
+    rewards: np.ndarray    # [steps] that were paid
     predicted: np.ndarray  # [steps, N]
-    credit: np.ndarray     # [steps of one episode, N] r - E over a_i ~ pi_i of the predicted r
+    expected: np.ndarray   # [steps, N] predicted E[r]
+    credit: np.ndarray     # [steps of one episode, N] with the predicted E[r]
+    true_expected: np.ndarray | None  # [steps, N], where the truth is known
+    true_credit: np.ndarray | None    # [steps of that episode, N]
+
+
+Truth = Callable[[RolloutRequest, int, Trajectory], np.ndarray]
+"""The true E[r] [T, W, N] of a recorded rollout, given its request, group and trajectory."""
 
 
 class RewardTraining:
@@ -98,27 +105,31 @@ class RewardTraining:
         networks = [member.adam.network for member in self._members]
         return reward_files.encode(networks, self._dataset.spec, self._reward)
 
-    def held_out(self) -> HeldOut:
+    def held_out(self, truth: Truth | None = None) -> HeldOut:
         """Predictions on the first held-out episodes."""
-        rewards, predictions, credit, kept = [], [], None, 0
+        parts: list[list[np.ndarray]] = []
+        credits: list[np.ndarray] = []
         for rollout, held in self._rollouts():
-            data, held = self._of_worlds(rollout.trajectory, held)
-            if not held.numel():
+            worlds = held.any(axis=0)
+            data, mask = self._of_worlds(rollout.trajectory, held)
+            if not mask.numel():
                 continue
             predicted = self._predict(data)
-            taken = advantages.of_actions(predicted, data.actions)
-            rewards.append(data.rewards[held])
-            predictions.append(taken[held])
-            kept += len(rewards[-1])
-            if credit is None:
-                steps = held[:, 0].nonzero().flatten()
-                ended = (data.terminated | data.truncated)[steps, 0].nonzero().flatten()
-                steps = steps[:int(ended[0]) + 1] if len(ended) else steps
-                expected = advantages.expected_rewards(predicted, data.probabilities)
-                credit = (data.rewards[:, 0:1] - expected[:, 0])[steps]
-            if kept >= SHOWN:
+            found = [data.rewards, advantages.of_actions(predicted, data.actions),
+                     advantages.expected_rewards(predicted, data.probabilities)]
+            found = [part.cpu().numpy() for part in found]
+            if truth is not None:
+                found.append(truth(rollout.request, rollout.group, rollout.trajectory)[:, worlds])
+            held = mask.cpu().numpy()
+            parts.append([part[held] for part in found])
+            if not credits:
+                episode = _first_episode(held[:, 0], (data.terminated | data.truncated)[:, 0].cpu().numpy())
+                credits = [found[0][episode, 0, None] - expected[episode, 0] for expected in found[2:]]
+            if sum(len(rewards) for rewards, *_ in parts) >= SHOWN:
                 break
-        return HeldOut(*(torch.cat(parts)[:SHOWN].cpu().numpy() for parts in (rewards, predictions)), credit.cpu().numpy())
+        rewards, predicted, *expected = (np.concatenate(part)[:SHOWN] for part in zip(*parts))
+        told = (expected[1], credits[1]) if truth is not None else (None, None)
+        return HeldOut(rewards, predicted, expected[0], credits[0], *told)
 
     def close(self) -> None:
         """Ends the threads."""
@@ -215,3 +226,10 @@ class RewardTraining:
 
     def _weights(self) -> list[dict[str, Tensor]]:
         return [{name: tensor.clone() for name, tensor in member.adam.state().items()} for member in self._members]
+
+
+def _first_episode(held: np.ndarray, ended: np.ndarray) -> np.ndarray:
+    """Steps of the first episode of one world that was held out, given which steps [T] were and which end an episode."""
+    steps = held.nonzero()[0]
+    ends = ended[steps].nonzero()[0]
+    return steps[:ends[0] + 1] if len(ends) else steps

@@ -13,24 +13,28 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dae_ros.files import write_atomically
+from dae_ros.replay.reward_training import HeldOut
 from dae_ros.report.style import BLUE, FAINT, GREY, INK, ROBOTS, plain
 
 
-def write_report(folder: Path, facts: Mapping[str, Any], errors: Sequence[float], baseline: float, rewards: np.ndarray,
-                 predicted: np.ndarray, credit: np.ndarray) -> None:
+def write_report(folder: Path, facts: Mapping[str, Any], errors: Sequence[float], baseline: float, held_out: HeldOut) -> None:
     """Writes the facts as JSON and the pictures of them.
 
-    errors: held-out mean squared error after each epoch; baseline: the mean reward's. rewards [steps] and predicted
-    [steps, N]: of held-out steps. credit [steps, N]: of one held-out episode.
+    errors: held-out mean squared error after each epoch; baseline: the mean reward's.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / 'report.json', (json.dumps(facts, indent=2, allow_nan=False) + '\n').encode())
-    figure = Figure(figsize=(12.0, 3.8), layout='constrained')
+    known = held_out.true_expected is not None
+    figure = Figure(figsize=(16.0 if known else 12.0, 3.8), layout='constrained')
     FigureCanvasAgg(figure)
-    curve, scatter, episode = figure.subplots(1, 3)
+    curve, scatter, episode, *truth = figure.subplots(1, 4 if known else 3)
     _draw_errors(curve, errors, baseline)
-    _draw_predictions(scatter, rewards, predicted)
-    _draw_credit(episode, credit)
+    _draw_predictions(scatter, 'reward of held-out steps', 'paid', np.repeat(held_out.rewards, held_out.predicted.shape[1]),
+                      held_out.predicted.ravel())
+    _draw_credit(episode, held_out.credit, held_out.true_credit)
+    if known:
+        _draw_predictions(truth[0], 'E[r] over own actions of held-out steps', 'true', held_out.true_expected.ravel(),
+                          held_out.expected.ravel())
     figure.savefig(folder / 'report.png', dpi=150, format='png')
 
 
@@ -55,19 +59,22 @@ def _draw_errors(axes: Axes, errors: Sequence[float], baseline: float) -> None:
     axes.legend(frameon=False, fontsize=8)
 
 
-def _draw_predictions(axes: Axes, rewards: np.ndarray, predicted: np.ndarray) -> None:
-    _axes(axes, 'reward of held-out steps', 'paid', 'predicted')
-    ends = [min(rewards.min(), predicted.min()), max(rewards.max(), predicted.max())]
+def _draw_predictions(axes: Axes, title: str, x: str, truth: np.ndarray, predicted: np.ndarray) -> None:
+    _axes(axes, title, x, 'predicted')
+    ends = [min(truth.min(), predicted.min()), max(truth.max(), predicted.max())]
     axes.plot(ends, ends, color=GREY, linewidth=0.8)
-    axes.plot(np.repeat(rewards, predicted.shape[1]), predicted.ravel(), '.', color=BLUE, alpha=0.2, markersize=3)
+    axes.plot(truth, predicted, '.', color=BLUE, alpha=0.2, markersize=3)
 
 
-def _draw_credit(axes: Axes, credit: np.ndarray) -> None:
-    _axes(axes, 'credit in one held-out episode', 'step', 'r − E[r] over own actions')
+def _draw_credit(axes: Axes, credit: np.ndarray, truth: np.ndarray | None) -> None:
+    known = '' if truth is None else ' (dashed: true)'
+    _axes(axes, f'credit in one held-out episode{known}', 'step', 'r − E[r] over own actions')
     axes.axhline(0, color=GREY, linewidth=0.6)
     for robot, values in enumerate(credit.T):
         axes.plot(values, color=ROBOTS[robot % len(ROBOTS)], linewidth=1.3, marker='.' if len(credit) < 30 else '',
                   label=f'robot {robot}')
+        if truth is not None:
+            axes.plot(truth[:, robot], color=ROBOTS[robot % len(ROBOTS)], linewidth=1.0, linestyle=(0, (4, 2)))
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     if credit.shape[1] <= len(ROBOTS):
         axes.legend(frameon=False, fontsize=8)

@@ -13,6 +13,8 @@ from dae_ros.ros import names
 from dae_ros.run_folder import RunFolder
 from dae_ros.worlds import world_spec
 
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+
 
 class NodeProcess(NamedTuple):
     """A process with one node of the same name, or with several."""
@@ -113,8 +115,19 @@ def read_settings(task_file: Path | None, overrides: Iterable[str]) -> Settings:
 
 def node_environment() -> dict[str, str]:
     """Environment variables for the nodes where the user has set none: this host only, and quick discovery."""
-    reach, profiles = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'
+    reach = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
     # SYSTEM_DEFAULT leaves it to the profile; LOCALHOST would overrule it and let only 32 processes find each other.
-    defaults = {reach: 'LOCALHOST' if profiles in os.environ else 'SYSTEM_DEFAULT',
-                profiles: str((shipped_config() / ('fastdds.xml' if reach in os.environ else 'fastdds_this_host.xml')).resolve())}
+    defaults = {reach: 'LOCALHOST' if _PROFILES in os.environ else 'SYSTEM_DEFAULT',
+                _PROFILES: _profiles('fastdds.xml' if reach in os.environ else 'fastdds_this_host.xml')}
     return {name: os.environ.get(name, value) for name, value in defaults.items()}
+
+
+def acknowledging_environment() -> dict[str, str]:
+    """Environment variables for a node that waits until its messages are acknowledged, which otherwise takes seconds."""
+    own = {_profiles(f'{name}.xml'): _profiles(f'{name}_player.xml') for name in ('fastdds', 'fastdds_this_host')}
+    given = os.environ.get(_PROFILES, _profiles('fastdds.xml'))
+    return {_PROFILES: own[given]} if given in own else {}
+
+
+def _profiles(name: str) -> str:
+    return str((shipped_config() / name).resolve())

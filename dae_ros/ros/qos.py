@@ -29,3 +29,13 @@ RECORDED = _reliable(8192, DurabilityPolicy.VOLATILE)
 
 RECORDED_LATCHED = _reliable(8192, DurabilityPolicy.TRANSIENT_LOCAL)
 """The same for what is latched: every value, and the last one before it came."""
+
+def _lossless(durability: DurabilityPolicy) -> QoSProfile:
+    return QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=0, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+
+
+REPLAYED = _lossless(DurabilityPolicy.VOLATILE)
+"""For who must lose nothing of a replay that is as fast as it is taken: what a full queue has no room for is sent again."""
+
+REPLAYED_LATCHED = _lossless(DurabilityPolicy.TRANSIENT_LOCAL)
+"""The same for what is latched."""

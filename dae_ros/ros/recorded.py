@@ -28,38 +28,50 @@ class RecordedTopic(NamedTuple):
     stamped: bool        # whether it is a datum of a step
 
 
+def rollout_topics(num_agents: int, world_groups: int) -> list[RecordedTopic]:
+    """What rollouts are made of."""
+    steps = [(names.JOINT_STATE, msg.JointState), (names.SHARED_REWARD, msg.SharedReward),
+             *((names.ACTION.format(robot), msg.Action) for robot in range(num_agents))]
+    return [_latched(names.ROLLOUT_REQUEST, msg.RolloutRequest),
+            *(_step(topic, kind, group, world_groups) for topic, kind in steps for group in range(world_groups))]
+
+
 def team_topics(num_agents: int, world_groups: int, everything: bool) -> list[RecordedTopic]:
-    """What rollouts are made of, or all that the team says."""
-    def step(topic: str, kind: type) -> list[RecordedTopic]:
-        return [RecordedTopic(names.in_group(topic, group, world_groups), kind, qos.RECORDED, qos.ROLLOUT, True)
-                for group in range(world_groups)]
-
-    def latched(topic: str, kind: type) -> RecordedTopic:
-        return RecordedTopic(topic, kind, qos.RECORDED_LATCHED, qos.LATCHED, False)
-
-    robots = range(num_agents)
-    topics = [latched(names.ROLLOUT_REQUEST, msg.RolloutRequest), latched(names.TRAINING_STATUS, msg.TrainingStatus),
-              *step(names.JOINT_STATE, msg.JointState), *step(names.SHARED_REWARD, msg.SharedReward),
-              *(topic for robot in robots for topic in step(names.ACTION.format(robot), msg.Action))]
+    """What rollouts are made of, and how the training gets on; or all that the team says."""
+    topics = [*rollout_topics(num_agents, world_groups), _latched(names.TRAINING_STATUS, msg.TrainingStatus)]
     if everything:
-        observations = (step(names.OBSERVATION.format(robot), msg.Observation) for robot in robots)
-        topics += [topic._replace(profile=qos.RECORDED_LATCHED, offered=qos.LATCHED) for found in observations for topic in found]
-        topics += [latched(names.POLICY, msg.PolicyWeights)]
+        observations = [_step(names.OBSERVATION.format(robot), msg.Observation, group, world_groups)
+                        for robot in range(num_agents) for group in range(world_groups)]
+        topics += [topic._replace(profile=qos.RECORDED_LATCHED, offered=qos.LATCHED) for topic in observations]
+        topics += [_latched(names.POLICY, msg.PolicyWeights)]
     return topics
+
+
+def _step(topic: str, kind: type, group: int, world_groups: int) -> RecordedTopic:
+    return RecordedTopic(names.in_group(topic, group, world_groups), kind, qos.RECORDED, qos.ROLLOUT, True)
+
+
+def _latched(topic: str, kind: type) -> RecordedTopic:
+    return RecordedTopic(topic, kind, qos.RECORDED_LATCHED, qos.LATCHED, False)
 
 
 def as_written(topic: RecordedTopic, full_name: str) -> Topic:
     """The topic for the bag."""
-    kind = f'{_package(topic.kind)}/msg/{topic.kind.__name__}'
-    definition = _definition(topic.kind)
+    kind = type_name(topic.kind)
+    definition = definition_of(topic.kind)
     return Topic(full_name, kind, definition, rihs01(kind, 'ros2msg', definition), _qos(topic.offered))
+
+
+def type_name(kind: type) -> str:
+    """As in `std_msgs/msg/String`."""
+    return f'{_package(kind)}/msg/{kind.__name__}'
 
 
 def _package(kind: type) -> str:
     return kind.__module__.split('.')[0]
 
 
-def _definition(kind: type) -> str:
+def definition_of(kind: type) -> str:
     """The message's file, comments and all, and those of the messages within it, as rosbag2 puts them together."""
     parts, wanted = [], [f'{_package(kind)}/{kind.__name__}']
     for name in wanted:

@@ -16,12 +16,13 @@ import rclpy
 from dae_ros_msgs.msg import TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
+from std_srvs.srv import Trigger
 
 from dae_ros import config
 from dae_ros.report.summary import Summary
 from dae_ros.rollout.in_process import train
 from dae_ros.ros import names, qos
-from dae_ros.ros.graph import training_graph
+from dae_ros.ros.graph import NodeProcess, training_graph
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
@@ -41,7 +42,7 @@ class Graph:
     """Node processes of one run, started one by one in the order a test wants."""
 
     def __init__(self, path: Path, values: dict, namespace: str = '', key_file: str = ''):
-        settings = config.from_flat(values)
+        self.settings = settings = config.from_flat(values)
         self.folder = RunFolder(path, settings)
         self._namespace = namespace
         self.processes = {process.name: process for process in training_graph(settings, self.folder, key_file)}
@@ -201,3 +202,35 @@ class Refusals:
                 if entry.key.startswith('refused '):
                     _, topic, reason = entry.key.split()
                     self.counted[status.name, topic, reason] = int(entry.value)
+
+
+class Recorder:
+    """A recorder beside a graph, and what it says of itself on /diagnostics."""
+
+    def __init__(self, graph: Graph, listener: Listener, bag: Path, name: str = 'recorder', **parameters):
+        self.sentence, self.values, self._name = '', {}, name
+        self._graph = graph
+        self._listener = listener
+        graph.processes[name] = NodeProcess('recorder', name, {'bag': str(bag), **parameters})
+        listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._hear, qos.EVENTS)
+
+    def _hear(self, report: DiagnosticArray) -> None:
+        for status in report.status:
+            if status.name == f'/{self._name}':
+                self.sentence, self.values = status.message, {value.key: value.value for value in status.values}
+
+    def record_run(self) -> None:
+        """Takes the graph through its whole run, of which the recorder hears everything."""
+        graph, listener = self._graph, self._listener
+        graph.start('trainer')
+        assert listener.call(Trigger, names.PAUSE, Trigger.Request()).success
+        graph.start(*(name for name in graph.names if name != 'trainer'))
+        listener.wait_for_status(lambda status: status.state == TrainingStatus.PAUSED)
+        listener.spin_until(lambda: self.sentence == 'recording', lambda: graph.log(self._name))
+        assert listener.call(Trigger, names.RESUME, Trigger.Request()).success
+        assert graph.wait() == 0, graph.log('trainer')
+        # A rollout of T steps with N robots: a request, T + 1 states, T rewards, N T actions. The graph is past the last of them.
+        task, run = graph.settings.task, graph.settings.run
+        rollouts = -(-run.total_steps // (task.num_worlds * run.num_steps)) + -(-run.evaluation_episodes // task.num_worlds)
+        least = rollouts * (1 + task.world_groups * (1 + run.num_steps * (2 + task.num_agents)))
+        listener.spin_until(lambda: int(self.values['messages']) > least, lambda: str(self.values))

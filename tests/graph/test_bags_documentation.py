@@ -32,19 +32,20 @@ def test_a_run_is_recorded_read_and_learnt_from_as_documented(domain, tmp_path):
     from diagnostic_msgs.msg import DiagnosticArray
 
     (tmp_path / 'config').symlink_to(REPOSITORY / 'config')
-    record, play, learn, use = ''.join(re.findall(r'```bash\n(.*?)```', TEXT, re.DOTALL)).splitlines()
+    record, train, play, learn, use = ''.join(re.findall(r'```bash\n(.*?)```', TEXT, re.DOTALL)).splitlines()
     recorder = subprocess.Popen(shell(record), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         with Listener() as listener:
             heard = []
             listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, heard.append, qos.EVENTS)
             listener.spin_until(lambda: heard)
-        finish(f'{play} {SHORTER}', tmp_path)
+        finish(f'{train} {SHORTER}', tmp_path)
     finally:
         recorder.terminate()
         said = recorder.communicate(timeout=60)[0]
     assert recorder.returncode == 0 and 'messages in bags/navigation' in said
 
+    assert 'messages played' in finish(play, tmp_path)
     code, = re.findall(r'```python\n(.*?)```', TEXT, re.DOTALL)
     output = finish(f"{sys.executable} -c '{code.replace(chr(39), chr(34))}'", tmp_path)
     assert '(25, 8, 3, 18)' in output  # the first rollouts of so short a run may be over before the recorder is found

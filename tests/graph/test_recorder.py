@@ -10,16 +10,14 @@ import time
 import numpy as np
 import pytest
 import yaml
-from dae_ros_msgs.msg import TrainingStatus
-from diagnostic_msgs.msg import DiagnosticArray
-from harness import REPOSITORY, SMALL, Listener, oracle
+from harness import REPOSITORY, SMALL, Listener, Recorder, oracle
 from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
 
 from dae_ros import config
 from dae_ros.replay.dataset import Dataset
 from dae_ros.rollout.in_process import train
-from dae_ros.ros import names, qos
+from dae_ros.ros import names
 from dae_ros.ros.graph import NodeProcess
 from dae_ros.ros.recorded import team_topics
 from dae_ros.run_folder import RunFolder
@@ -39,39 +37,16 @@ def trajectories(folder, values):
     return seen
 
 
-class Recorder:
-    """What the recorder says of itself on /diagnostics."""
-
-    def __init__(self, listener, name='recorder'):
-        self.sentence, self.values, self._name = '', {}, f'/{name}'
-        listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._hear, qos.EVENTS)
-
-    def _hear(self, report):
-        for status in report.status:
-            if status.name == self._name:
-                self.sentence, self.values = status.message, {value.key: value.value for value in status.values}
-
-
 @pytest.mark.parametrize('parameters, end', [
     ({}, signal.SIGINT), ({'storage': 'sqlite3'}, signal.SIGTERM), ({'compression': 'zstd', 'split_megabytes': 1}, signal.SIGINT),
     ({}, signal.SIGKILL)], ids=['mcap', 'sqlite3', 'split and compressed', 'killed'])
 def test_a_recorded_run_holds_every_message_and_its_trajectories_bit_for_bit(parameters, end, make_graph, tmp_path):
     graph = make_graph(tmp_path / 'graph', SMALL)
-    graph.processes['recorder'] = NodeProcess('recorder', 'recorder', {'bag': str(tmp_path / 'bag'), **parameters})
+    expected = trajectories(tmp_path / 'alone', SMALL)
     with Listener() as listener:
-        recorder = Recorder(listener)
-        graph.start('trainer')
-        assert listener.call(Trigger, 'trainer/pause', Trigger.Request()).success
-        graph.start(*(name for name in graph.names if name != 'trainer'))
-        listener.wait_for_status(lambda status: status.state == TrainingStatus.PAUSED)
-        listener.spin_until(lambda: recorder.sentence == 'recording', lambda: graph.log('recorder'))
-        assert listener.call(Trigger, 'trainer/resume', Trigger.Request()).success
-        assert graph.wait() == 0, graph.log('trainer')
-        expected = trajectories(tmp_path / 'alone', SMALL)
-        at_least = len(expected) * (1 + 26 + 25 + 3 * 25)
-        listener.spin_until(lambda: int(recorder.values['messages']) > at_least, lambda: str(recorder.values))
+        Recorder(graph, listener, tmp_path / 'bag', **parameters).record_run()
     time.sleep(1.0)  # what a kill may cost
-    os.kill(graph._supervisor._processes['recorder'].pid, end)
+    os.kill(graph.pids['recorder'], end)
     code = graph.wait('recorder')
     assert code == (-end if end == signal.SIGKILL else 0)
     if code == 0:
@@ -87,17 +62,15 @@ def test_a_recorded_run_holds_every_message_and_its_trajectories_bit_for_bit(par
 def test_a_recorder_killed_and_started_again_disturbs_nothing_and_both_bags_are_read_as_one(make_graph, tmp_path):
     values = {**SMALL, 'total_steps': 40 * 8 * 25}
     graph = make_graph(tmp_path / 'graph', values)
-    for name in ('first', 'second'):
-        graph.processes[name] = NodeProcess('recorder', name, {'bag': str(tmp_path / 'bags' / name)})
     with Listener() as listener:
-        first, second = Recorder(listener, 'first'), Recorder(listener, 'second')
+        first, second = (Recorder(graph, listener, tmp_path / 'bags' / name, name) for name in ('first', 'second'))
         graph.start(*(name for name in graph.names if name != 'second'))
         listener.spin_until(lambda: int(first.values.get('messages', 0)) > 3 * 150, lambda: graph.log('first'))
         graph.kill('first')
-        assert listener.call(Trigger, 'trainer/pause', Trigger.Request()).success
+        assert listener.call(Trigger, names.PAUSE, Trigger.Request()).success
         graph.start('second')
         listener.spin_until(lambda: second.sentence == 'recording', lambda: graph.log('second'))
-        assert listener.call(Trigger, 'trainer/resume', Trigger.Request()).success
+        assert listener.call(Trigger, names.RESUME, Trigger.Request()).success
         assert graph.wait() == 0, graph.log('trainer')
     graph.stop()
     expected = trajectories(tmp_path / 'alone', values)
@@ -113,10 +86,9 @@ def test_a_recorder_killed_and_started_again_disturbs_nothing_and_both_bags_are_
 
 def test_what_the_recorder_writes_is_read_without_our_messages(make_graph, tmp_path):
     graph = make_graph(tmp_path / 'graph', SMALL)
-    graph.processes['recorder'] = NodeProcess('recorder', 'recorder', {'bag': str(tmp_path / 'bag'), 'everything': True})
-    graph.start('recorder')
     with Listener() as listener:
-        recorder = Recorder(listener)
+        recorder = Recorder(graph, listener, tmp_path / 'bag', everything=True)
+        graph.start('recorder')
         listener.spin_until(lambda: recorder.sentence.startswith('waiting for rollout_request'), lambda: graph.log('recorder'))
         graph.start(*(name for name in graph.names if name != 'recorder'))
         assert graph.wait() == 0, graph.log('trainer')
