@@ -52,6 +52,8 @@ class Refused(DaeRosError):
     OUT_OF_RANGE = 'out_of_range'
     OVERSIZED = 'oversized'
     CORRUPT = 'corrupt'
+    WRONG_FRAME = 'wrong_frame'
+    JUMP = 'jump'
 
     def __init__(self, reason: str, detail: str):
         super().__init__(f'{reason}: {detail}')
