@@ -15,6 +15,13 @@ GET_POLICY = 'get_policy'
 PAUSE = 'trainer/pause'
 RESUME = 'trainer/resume'
 SAVE = 'trainer/save'
+ODOMETRY = 'robot_{}/odom'
+COMMAND = 'robot_{}/cmd_vel'
+LANDMARKS = 'landmarks'
+MARKERS = 'markers'
+TRANSFORMS = '/tf'
+ACTIVATE_POLICY = '~/activate_policy'
+ENABLE = '~/enable'
 DIAGNOSTICS = '/diagnostics'
 
 
