@@ -3,8 +3,8 @@ from glob import glob
 
 from setuptools import find_packages, setup
 
-EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'recorder', 'robot_agent', 'robot_bridge', 'train_reward',
-               'trainer', 'world')
+EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'recorder', 'robot_agent', 'robot_bridge', 'robot_world',
+               'train_reward', 'trainer', 'world')
 
 setup(
     name='dae_ros',

@@ -199,6 +199,16 @@ class BodySettings:
 
 
 @dataclass(frozen=True)
+class RobotWorldSettings:
+    """How our own simulator plays the robots."""
+
+    real_time_factor: float = setting(1.0, 'seconds simulated per second; other than 1 it publishes /clock, and all others need '
+                                           'use_sim_time', minimum=0.01, maximum=1000.0)
+    odometry_rate: float = setting(50.0, 'odometry per simulated second', unit='Hz', minimum=1.0, maximum=1000.0)
+    reset_episodes: bool = setting(False, 'put robots and landmarks elsewhere whenever an episode begins')
+
+
+@dataclass(frozen=True)
 class BridgeSettings:
     """What lets a robot move, and what makes it stop."""
 
@@ -316,7 +326,7 @@ SETTINGS: dict[str, SettingInfo] = {info.name: info for info in declarations(*ge
 """Those of a run, which a task file may set."""
 
 ROBOT_SETTINGS: dict[str, SettingInfo] = {
-    info.name: info for info in declarations(ExecutionSettings, BodySettings, BridgeSettings)}
+    info.name: info for info in declarations(ExecutionSettings, BodySettings, RobotWorldSettings, BridgeSettings)}
 """Those of trained teams on robots; a task file may set them too, each node takes its own."""
 
 

@@ -40,7 +40,7 @@ class RobotBridgeNode(TeamNode):
         self._body_frame = ''
         self._sending, self._ended = threading.Lock(), False
         self._pilot = make_pilot(settings)
-        self._commands = self.publisher(TwistStamped if self._stamped else Twist, names.COMMAND.format(robot), qos.COMMAND)
+        self._commands = self.publisher(TwistStamped if self._stamped else Twist, names.COMMAND.format(robot), qos.NEWEST)
         self._observations = self.publisher(msg.Observation, names.OBSERVATION.format(robot), qos.LATCHED)
         for other in range(settings['num_agents']):
             self.listen(Odometry, names.ODOMETRY.format(other), qos.SENSOR, partial(self._on_odometry, other))

@@ -59,6 +59,10 @@ class TaskFrame(NamedTuple):
         """Positions [..., 2] in task units."""
         return (np.asarray(metres, np.float64) - self.origin) / self.scale
 
+    def metres(self, positions: np.ndarray) -> np.ndarray:
+        """Positions [..., 2] in the robots' world, in m, of those in task units."""
+        return np.asarray(positions, np.float64) * self.scale + self.origin
+
     def velocities(self, metres_per_second: np.ndarray) -> np.ndarray:
         """Velocities [..., 2] in task units per second of the task."""
         return np.asarray(metres_per_second, np.float64) * (self.slowness / self.scale)

@@ -29,15 +29,20 @@ def task_frame(settings: Mapping[str, Any]) -> TaskFrame:
     return TaskFrame(settings['scale'], (settings['origin_x'], settings['origin_y']), slowness)
 
 
+def limits_in(settings: Mapping[str, Any]) -> Limits:
+    """What a robot can do."""
+    return Limits(*(settings[f'max_{name}'] for name in Limits._fields))
+
+
 def make_pilot(settings: Mapping[str, Any]) -> Pilot:
     """The pilot of one robot. Raises SettingsError where settings do not fit each other."""
     robot, monitor, frame = settings['robot'], TaskMonitor(task_settings(settings)), task_frame(settings)
     num_agents = monitor.spec.num_agents
     if robot >= num_agents:
         raise SettingsError(f'robot must lie in 0 .. {num_agents - 1} where num_agents is {num_agents}, not {robot}')
-    limits = Limits(*(settings[f'max_{name}'] for name in Limits._fields))
+    motion = Motion(settings['drive'] == 'differential', limits_in(settings), frame)
     bounds = Bounds(*(settings[name] for name in Bounds._fields))
-    return Pilot(robot, settings['run'] or RUN, monitor, Motion(settings['drive'] == 'differential', limits, frame), frame,
+    return Pilot(robot, settings['run'] or RUN, monitor, motion, frame,
                  1.0 / settings['control_rate'], Safety(robot, num_agents, bounds, settings['enabled']))
 
 

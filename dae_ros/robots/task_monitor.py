@@ -24,16 +24,21 @@ class Sight(NamedTuple):
     reward: float             # earned by the joint action that led here; paid at once, whatever the reward_delay
 
 
+def one_team(task: TaskSettings) -> ParticleWorlds:
+    """One world of the task. Raises SettingsError where the task is not one of robots in the plane."""
+    worlds = make_worlds(side_by_side(task, 1))
+    if not isinstance(worlds, ParticleWorlds):
+        worlds.close()
+        raise SettingsError(f'task {task.task!r} is not one of robots in the plane, such as navigation')
+    return worlds
+
+
 class TaskMonitor:
     """One team of a particle task whose robots move outside."""
 
     def __init__(self, task: TaskSettings):
         """Raises SettingsError where the task is not one of robots in the plane."""
-        worlds = make_worlds(side_by_side(task, 1))
-        if not isinstance(worlds, ParticleWorlds):
-            worlds.close()
-            raise SettingsError(f'task {task.task!r} is not one of robots in the plane, such as navigation')
-        self._worlds = worlds
+        self._worlds = one_team(task)
 
     @property
     def spec(self) -> WorldSpec:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, PoseArray, Quaternion, Twist, TwistStamped, Vector3
+from geometry_msgs.msg import Point, PoseArray, Quaternion, TransformStamped, Twist, TwistStamped, Vector3
 from geometry_msgs.msg import Pose as PoseMessage
 from nav_msgs.msg import Odometry
 
@@ -49,6 +49,14 @@ def odometry_message(pose: Pose, turn: float, world_frame: str, body_frame: str)
     message.pose.pose = pose_message(pose.position, pose.heading)
     forward, left = turned(pose.velocity, -pose.heading)
     message.twist.twist = Twist(linear=Vector3(x=forward, y=left), angular=Vector3(z=turn))
+    return message
+
+
+def transform_message(pose: Pose, world_frame: str, body_frame: str) -> TransformStamped:
+    message = TransformStamped(child_frame_id=body_frame)
+    message.header.frame_id, message.header.stamp = world_frame, time_message(pose.time)
+    message.transform.translation = Vector3(x=pose.position[0], y=pose.position[1])
+    message.transform.rotation = pose_message(pose.position, pose.heading).orientation
     return message
 
 

@@ -28,8 +28,8 @@ SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5, reliability=Reliab
                     durability=DurabilityPolicy.VOLATILE)
 """Odometry: only the newest counts, and whoever publishes it may be reliable or not."""
 
-COMMAND = _reliable(1, DurabilityPolicy.VOLATILE)
-"""Velocity commands: a base may listen reliably or not."""
+NEWEST = _reliable(1, DurabilityPolicy.VOLATILE)
+"""For publishers of what soon has a successor, such as velocity commands: others may listen reliably or not."""
 
 RECORDED = _reliable(8192, DurabilityPolicy.VOLATILE)
 """For the recorder, whom nobody waits for: data queue up while the disk is slow."""

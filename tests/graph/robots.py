@@ -76,7 +76,6 @@ class Stage(Listener):
         node = self.node
         self.clock = node.create_publisher(Clock, '/clock', 10)
         self.landmarks = node.create_publisher(PoseArray, names.LANDMARKS, qos.LATCHED)
-        self.landmarks.publish(convert_robots.landmarks_message(LANDMARKS, self.now, FRAME))
         self.odometry = [node.create_publisher(Odometry, names.ODOMETRY.format(robot), 10) for robot in range(3)]
         for robot in range(3):
             for kind, topic, profile, heard in ((command, names.COMMAND, 10, self.commands),
@@ -94,7 +93,8 @@ class Stage(Listener):
             self.diagnostics[status.name.strip('/')].append(status.message)
 
     def wait_for_bridges(self, number: int) -> None:
-        """Waits until bridges hear and are heard."""
+        """Shows the landmarks, and waits until bridges hear and are heard."""
+        self.landmarks.publish(convert_robots.landmarks_message(LANDMARKS, self.now, FRAME))
         self.spin_until(lambda: all(publisher.get_subscription_count() >= number for publisher in self.odometry))
         self.spin_until(lambda: self.clock.get_subscription_count() >= number)
         self.spin_until(lambda: sum(self.node.count_publishers(names.COMMAND.format(robot)) for robot in range(3)) >= number)

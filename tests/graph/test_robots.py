@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 import signal
+from collections import Counter
+from functools import partial
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseArray, TwistStamped
 from harness import SMALL
+from nav_msgs.msg import Odometry
 from robots import LANDMARKS, PLACES, POLICY, Processes, Stage, is_standing
 from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
 
 from dae_ros.robots.acting import ActingEnd
 from dae_ros.ros import convert_robots, names, qos
@@ -151,3 +155,29 @@ def test_the_navigation_team_covers_the_landmarks_with_foreign_differential_robo
         distances.append(np.linalg.norm(places[:, None] - robots[None], axis=-1).min(axis=1).mean())
         truth.clear()
     assert sum(distance < CLOSE for distance in distances) >= NEEDED, np.round(distances, 2)
+
+
+def test_our_simulator_plays_robots_that_the_same_bridges_drive(domain, stage, processes):
+    """Topic by topic what a real robot has: odometry, landmarks, markers, and a clock since it runs faster."""
+    body = {'drive': 'holonomic', 'max_speed': 2.0, 'max_acceleration': 5.0}
+    processes.node('robot_world', 'robots', real_time_factor=4.0, **body)
+    for robot in range(3):
+        start_robot(processes, robot, **body, odometry_timeout=0.6, action_timeout=1.0)
+    shown, odometry, landmarks = [], {}, []
+    stage.node.create_subscription(MarkerArray, names.MARKERS, shown.append, qos.SENSOR)
+    stage.node.create_subscription(PoseArray, names.LANDMARKS, landmarks.append, qos.LATCHED_INPUT)
+    for robot in range(3):
+        stage.node.create_subscription(Odometry, names.ODOMETRY.format(robot), partial(odometry.__setitem__, robot), qos.SENSOR)
+
+    def distance():
+        places = convert_robots.landmarks(landmarks[-1], 'map')
+        robots = np.array([convert_robots.odometry(odometry[robot], 'map').position for robot in range(3)])
+        return np.linalg.norm(places[:, None] - robots[None], axis=-1).min(axis=1).mean()
+
+    stage.spin_until(lambda: len(odometry) == 3 and len(landmarks) > 1 and distance() < CLOSE)
+    stage.spin_until(lambda: bool(shown))
+    kinds = Counter(marker.ns for marker in shown[-1].markers)
+    assert kinds == {'robots': 3, 'headings': 3, 'landmarks': 3, 'targets': 3}
+    assert stage.call(Trigger, 'robots/next_episode', Trigger.Request()).message == 'episode 1'
+    stage.spin_until(lambda: distance() > CLOSE)
+    stage.spin_until(lambda: distance() < CLOSE)
