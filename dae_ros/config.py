@@ -204,7 +204,7 @@ class RobotWorldSettings:
 
     real_time_factor: float = setting(1.0, 'seconds simulated per second; other than 1 it publishes /clock, and all others need '
                                            'use_sim_time', minimum=0.01, maximum=1000.0)
-    odometry_rate: float = setting(50.0, 'odometry per simulated second', unit='Hz', minimum=1.0, maximum=1000.0)
+    odometry_rate: float = setting(20.0, 'odometry per simulated second', unit='Hz', minimum=1.0, maximum=1000.0)
     reset_episodes: bool = setting(False, 'put robots and landmarks elsewhere whenever an episode begins')
 
 

@@ -1,7 +1,8 @@
-"""bringup: trains a team from one task file: starts the whole graph, shows its progress, and stops it again.
+"""bringup: trains a team from one task file, or drives robots with it: starts the whole graph, and stops it again.
 
     ros2 run dae_ros bringup navigation -p seed:=2
     ros2 run dae_ros bringup config/navigation.yaml --in-process
+    ros2 run dae_ros bringup navigation --execute runs/mine/policy.safetensors
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from pathlib import Path
 
 from dae_ros import torchrun
 from dae_ros.command import interrupt_on_sigterm, run_command
-from dae_ros.config import SETTINGS, Settings
+from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
+from dae_ros.errors import SettingsError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.report.summary import Summary
 from dae_ros.ros.graph import find_task_file, read_settings
@@ -22,9 +24,11 @@ from dae_ros.worlds import world_spec
 
 
 def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
-    settings_help = '\n'.join(f'  {info.name} := {info.default!r}  {info.describe()}' for info in SETTINGS.values())
+    settings_help, robots_help = ('\n'.join(f'  {info.name} := {info.default!r}  {info.describe()}' for info in group.values())
+                                  for group in (SETTINGS, ROBOT_SETTINGS))
     parser = argparse.ArgumentParser(prog='bringup', description=__doc__.split('\n')[0].removeprefix('bringup: '),
-                                     epilog=f'settings (in the task file, or with -p):\n{settings_help}',
+                                     epilog=f'settings (in the task file, or with -p):\n{settings_help}\n\n'
+                                            f'with --execute also:\n{robots_help}',
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('task_file', nargs='?', help='a task file, or the name of one that comes with the package, such as '
                                                      'navigation; without one every setting has its default')
@@ -33,6 +37,9 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
                                                         'an unfinished run of the same settings resumes it')
     parser.add_argument('--namespace', default='', help='namespace of the team, so that several can run side by side')
     parser.add_argument('--in-process', action='store_true', help='the same run, bit for bit, in this process without ROS')
+    parser.add_argument('--execute', metavar='POLICY', help='drive robots with a trained team: a policy file, the name of one '
+                                                            'that comes with the package, or parameter_server for what that has')
+    parser.add_argument('--simulate', action='store_true', help='with --execute: our simulator plays the robots')
     return parser.parse_args(arguments)
 
 
@@ -62,8 +69,26 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
     GraphRun(settings, folder, namespace, display).run()
 
 
+def execute(arguments: argparse.Namespace) -> None:
+    """Drives robots until Ctrl-C."""
+    from dae_ros.ros.execution import execution_graph, find_policy, read_values, write_values
+    from dae_ros.ros.execution_run import ExecutionRun
+
+    values = read_values(find_task_file(arguments.task_file) if arguments.task_file else None, arguments.parameter)
+    folder = arguments.run_folder or Path('runs') / f'execution-{datetime.now():%Y%m%d-%H%M%S}'
+    processes = execution_graph(values, find_policy(arguments.execute), arguments.simulate)
+    print(f'driving; Ctrl-C stops the robots (logs of the nodes in {folder / "logs"})', flush=True)
+    settings_file = write_values(values, folder / 'settings.yaml')
+    ExecutionRun(processes, settings_file, arguments.namespace, lambda line: print(line, flush=True)).run()
+
+
 def bring_up(arguments: argparse.Namespace) -> int:
     """The run that the arguments describe, or this process's part of its learning. The exit code."""
+    if arguments.simulate and not arguments.execute:
+        raise SettingsError('--simulate goes with --execute POLICY')
+    if arguments.execute:
+        execute(arguments)
+        return 0
     if torchrun.rank() > 0:
         from dae_ros.learning.distributed import help_to_learn
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import signal
+import subprocess
+import sys
 from collections import Counter
 from functools import partial
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseArray, TwistStamped
-from harness import SMALL
+from harness import SMALL, TIMEOUT, processes_naming
 from nav_msgs.msg import Odometry
 from robots import LANDMARKS, PLACES, POLICY, Processes, Stage, is_standing
 from std_srvs.srv import SetBool, Trigger
@@ -174,10 +176,37 @@ def test_our_simulator_plays_robots_that_the_same_bridges_drive(domain, stage, p
         robots = np.array([convert_robots.odometry(odometry[robot], 'map').position for robot in range(3)])
         return np.linalg.norm(places[:, None] - robots[None], axis=-1).min(axis=1).mean()
 
-    stage.spin_until(lambda: len(odometry) == 3 and len(landmarks) > 1 and distance() < CLOSE)
+    stage.spin_until(lambda: len(odometry) == 3 and landmarks and distance() < CLOSE)
     stage.spin_until(lambda: bool(shown))
     kinds = Counter(marker.ns for marker in shown[-1].markers)
     assert kinds == {'robots': 3, 'headings': 3, 'landmarks': 3, 'targets': 3}
     assert stage.call(Trigger, 'robots/next_episode', Trigger.Request()).message == 'episode 1'
     stage.spin_until(lambda: distance() > CLOSE)
     stage.spin_until(lambda: distance() < CLOSE)
+
+
+def test_bringup_drives_a_simulated_team_until_it_is_stopped_and_leaves_nothing(stage, tmp_path):
+    command = [sys.executable, '-m', 'dae_ros_nodes.bringup', 'navigation', '--execute', 'navigation', '--simulate',
+               '--run-folder', str(tmp_path / 'run')]
+    # Tests that were started in the background ignore SIGINT, and so would whatever they start.
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL))
+    try:
+        stage.spin_until(lambda: all(any(not is_standing(command) for command in stage.commands[robot]) for robot in range(3)))
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=TIMEOUT)
+    finally:
+        process.kill()
+    assert process.returncode == 130 and 'stopped' in errors and 'driving' in output, errors
+    assert not processes_naming(str(tmp_path))
+    stage.spin_until(lambda: all(is_standing(stage.commands[robot][-1]) for robot in range(3)))
+
+
+def test_a_robot_bringup_that_cannot_begin_says_why(domain, tmp_path):
+    for arguments, sentence in ((['--execute', 'nowhere'], 'there is no policy file nowhere'),
+                                (['--execute', 'navigation', '-p', 'max_sped:=1'], "did you mean 'max_speed'?"),
+                                (['--simulate'], '--simulate goes with --execute POLICY')):
+        done = subprocess.run([sys.executable, '-m', 'dae_ros_nodes.bringup', 'navigation', *arguments], cwd=tmp_path,
+                              capture_output=True, text=True, timeout=TIMEOUT)
+        assert done.returncode == 2 and sentence in done.stderr and 'Traceback' not in done.stderr, done.stderr
+    assert not list(tmp_path.iterdir())
