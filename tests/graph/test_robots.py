@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+import re
 import signal
 import subprocess
 import sys
 from collections import Counter
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseArray, TwistStamped
-from harness import SMALL, TIMEOUT, processes_naming
+from harness import REPOSITORY, SMALL, TIMEOUT, processes_naming
 from nav_msgs.msg import Odometry
 from robots import LANDMARKS, PLACES, POLICY, Processes, Stage, is_standing
 from std_srvs.srv import SetBool, Trigger
@@ -210,3 +212,21 @@ def test_a_robot_bringup_that_cannot_begin_says_why(domain, tmp_path):
                               capture_output=True, text=True, timeout=TIMEOUT)
         assert done.returncode == 2 and sentence in done.stderr and 'Traceback' not in done.stderr, done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_the_commands_of_the_documentation_drive_a_robot(stage, processes):
+    """The agent's and the bridge's, with the service that enables it; bringup's is tried above."""
+    commands = ''.join(re.findall(r'```bash\n(.*?)```', (REPOSITORY / 'docs/robots.md').read_text(), re.DOTALL)).splitlines()
+    bringup, agent, bridge, enable = commands
+    assert 'bringup navigation --execute navigation --simulate' in bringup
+    for name, command in (('agent_0', agent), ('bridge_0', bridge)):
+        assert f'__node:={name}' in command
+        executable, *arguments = re.sub(r'-r \S+:=/tb3_\S+', '', command).replace('config/', f'{REPOSITORY}/config/').split()
+        processes.python(name, f'dae_ros_nodes.{Path(executable).name}', *arguments, '-p', 'use_sim_time:=true')
+    stage.wait_for_bridges(1)
+    service, kind, request = enable.split(maxsplit=5)[3:]
+    assert (kind, request) == ('std_srvs/srv/SetBool', "'{data: true}'")
+    assert stage.call(SetBool, service, SetBool.Request(data=True)).success
+    stage.start_driving(0, 0, 1, 2)
+    speeds = [abs(stage.drive(0, 0, 1, 2).linear.x) for _ in range(10)]
+    assert max(speeds) <= 0.3
