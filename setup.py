@@ -4,7 +4,7 @@ from glob import glob
 from setuptools import find_packages, setup
 
 EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'recorder', 'robot_agent', 'robot_bridge', 'robot_world',
-               'train_reward', 'trainer', 'world')
+               'stream_trainer', 'task_monitor', 'train_reward', 'trainer', 'world')
 
 setup(
     name='dae_ros',

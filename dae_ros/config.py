@@ -250,6 +250,14 @@ class RecorderSettings:
 
 
 @dataclass(frozen=True)
+class StreamSettings:
+    """How the trainer takes what robots do at their own rate."""
+
+    max_staleness: int = setting(2, 'updates that the policy of an action may be behind', unit='updates', minimum=0,
+                                 maximum=1_000_000)
+
+
+@dataclass(frozen=True)
 class TrainerSettings:
     """What is particular to the trainer."""
 
@@ -326,7 +334,7 @@ SETTINGS: dict[str, SettingInfo] = {info.name: info for info in declarations(*ge
 """Those of a run, which a task file may set."""
 
 ROBOT_SETTINGS: dict[str, SettingInfo] = {
-    info.name: info for info in declarations(ExecutionSettings, BodySettings, RobotWorldSettings, BridgeSettings)}
+    info.name: info for info in declarations(ExecutionSettings, BodySettings, RobotWorldSettings, BridgeSettings, StreamSettings)}
 """Those of trained teams on robots; a task file may set them too, each node takes its own."""
 
 

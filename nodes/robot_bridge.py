@@ -20,13 +20,12 @@ from std_srvs.srv import SetBool
 from dae_ros.config import AgentSettings, BodySettings, BridgeSettings, RunBinding, TaskSettings, declarations
 from dae_ros.errors import Refused, SettingsError
 from dae_ros.robots.motion import STOP, Command
-from dae_ros.robots.pilot import Turn
+from dae_ros.robots.pilot import LOOKS, Turn
 from dae_ros.robots.safety import Stop
 from dae_ros.robots.setup import landmarks_in, make_pilot
 from dae_ros.ros import convert, convert_robots, names, qos
 from dae_ros.ros.node import TeamNode, run
 
-LOOKS = 5  # in each control period
 LAST_WORD = Duration(seconds=0.5)  # for the last command to arrive
 
 
@@ -60,7 +59,7 @@ class RobotBridgeNode(TeamNode):
         self._commands.wait_for_all_acked(LAST_WORD)
 
     def _on_odometry(self, robot: int, message: Odometry) -> None:
-        now = self._now()
+        now = self.now()
         if now == 0.0:  # simulated time has not begun
             return
         self._pilot.on_odometry(robot, convert_robots.odometry(message, self._world_frame), now)
@@ -88,7 +87,7 @@ class RobotBridgeNode(TeamNode):
 
     def _look(self) -> None:
         before = self._pilot.stop
-        turn: Turn = self._pilot.look(self._now())
+        turn: Turn = self._pilot.look(self.now())
         if turn.command is not None:
             self._send(turn.command)
         if turn.observation is not None:
@@ -99,13 +98,10 @@ class RobotBridgeNode(TeamNode):
             self.publish_diagnostics()
 
     def _send(self, command: Command) -> None:
-        message = convert_robots.command_message(command, self._stamped, self._now(), self._body_frame)
+        message = convert_robots.command_message(command, self._stamped, self.now(), self._body_frame)
         with self._sending:
             if not self._ended:
                 self._commands.publish(message)
-
-    def _now(self) -> float:
-        return self.get_clock().now().nanoseconds / convert_robots.NANOSECONDS
 
     def diagnose(self):
         stop, values = self._pilot.stop, {'robot': self.settings['robot'], 'enabled': self._pilot.enabled}

@@ -57,11 +57,11 @@ class RobotWorldNode(TeamNode):
         steady = SystemClock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(self._period / settings['real_time_factor'], self._guarded(self._tick), clock=steady)
 
-    def _now(self) -> float:
-        return self._time if self._is_clock else self.get_clock().now().nanoseconds / convert_robots.NANOSECONDS
+    def now(self) -> float:
+        return self._time if self._is_clock else super().now()
 
     def _on_command(self, robot: int, message: Twist | TwistStamped) -> None:
-        self._bodies.obey(robot, convert_robots.command(message), self._now())
+        self._bodies.obey(robot, convert_robots.command(message), self.now())
 
     def _on_next_episode(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._begin(self._episode + 1)
@@ -74,11 +74,11 @@ class RobotWorldNode(TeamNode):
         self._show_landmarks()
 
     def _show_landmarks(self) -> None:
-        self._landmarks.publish(convert_robots.landmarks_message(self._bodies.landmarks, self._now(), self._world_frame))
+        self._landmarks.publish(convert_robots.landmarks_message(self._bodies.landmarks, self.now(), self._world_frame))
 
     def _tick(self) -> None:
         self._time = round(self._time + self._period, 6)
-        now = self._now()
+        now = self.now()
         if self.settings['reset_episodes']:
             episode = stamp_at(now, 1.0 / self.settings['control_rate'], self._bodies.episode_steps, 0).rollout
             if episode != self._episode:

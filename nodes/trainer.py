@@ -21,6 +21,7 @@ from dae_ros.config import (
     LearnerSettings,
     RewardNetworkSettings,
     RunSettings,
+    SettingInfo,
     TaskSettings,
     TrainerSettings,
     declarations,
@@ -55,9 +56,11 @@ class GroupInputs(NamedTuple):
 class TrainerNode(TeamNode):
     """Wires a `Training` and its `GroupedAssembler` to their topics. Learning happens in the callback of the last datum."""
 
-    def __init__(self):
-        super().__init__('trainer', declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings,
-                                                 TrainerSettings))
+    def __init__(self, name: str = 'trainer', *more: SettingInfo):
+        """`more` settings are for subclasses."""
+        super().__init__(name, [*declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings,
+                                              TrainerSettings), *more])
+        self._more = {info.name: self.settings.pop(info.name) for info in more}
         folder = self.settings.pop('run_folder')
         settings = from_flat(self.settings)
         task = settings.task
@@ -65,7 +68,7 @@ class TrainerNode(TeamNode):
         folder = Path(folder or f'runs/{task.task.replace(":", "_")}_n{spec.num_agents}_seed{settings.run.seed}')
         self._folder = RunFolder(folder, settings)
         self._training = Training(settings, spec, self._folder)
-        self._assembler = GroupedAssembler(spec, task.worlds_per_group, task.world_groups)
+        self._assembler = self._make_assembler()
         self._state = Status.WAITING
         self._paused = False
 
@@ -84,6 +87,10 @@ class TrainerNode(TeamNode):
         self.every(min(SHORT_PATIENCE, settings.run.rollout_timeout) / 4, self._begin_anew_if_silent)
         self._publish_policy()
         self._advance()
+
+    def _make_assembler(self):
+        task = self._training.settings.task
+        return GroupedAssembler(self._training.spec, task.worlds_per_group, task.world_groups)
 
     def _listen_to_group(self, group: int) -> GroupInputs:
         """What comes on a group's topics goes to its assembler and to no other."""

@@ -19,6 +19,7 @@ from dae_ros.rollout.lockstep import check_action
 from dae_ros.types import Action, Observation, Stamp
 
 LARGEST_ROLLOUT = 2**32  # what a stamp can hold
+LOOKS = 5  # in each control period
 
 
 class Turn(NamedTuple):

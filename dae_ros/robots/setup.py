@@ -13,6 +13,7 @@ from dae_ros.robots.motion import Limits, Motion
 from dae_ros.robots.pilot import Pilot
 from dae_ros.robots.safety import Bounds, Safety
 from dae_ros.robots.task_monitor import TaskMonitor
+from dae_ros.robots.watch import Watch
 from dae_ros.worlds.particle import TIME_STEP
 
 RUN = 1  # of stamps where nobody named a run
@@ -44,6 +45,13 @@ def make_pilot(settings: Mapping[str, Any]) -> Pilot:
     bounds = Bounds(*(settings[name] for name in Bounds._fields))
     return Pilot(robot, settings['run'] or RUN, monitor, motion, frame,
                  1.0 / settings['control_rate'], Safety(robot, num_agents, bounds, settings['enabled']))
+
+
+def make_watch(settings: Mapping[str, Any]) -> Watch:
+    """Who watches the whole team. Raises SettingsError."""
+    bounds = Bounds(*(settings[name] for name in Bounds._fields))
+    return Watch(settings['run'] or RUN, TaskMonitor(task_settings(settings)), task_frame(settings),
+                 1.0 / settings['control_rate'], bounds)
 
 
 def landmarks_in(text: str) -> np.ndarray:

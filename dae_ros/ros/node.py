@@ -89,6 +89,10 @@ class TeamNode(Node):
 
         return call
 
+    def now(self) -> float:
+        """The time of this node's clock [s]; 0 before simulated time has begun."""
+        return self.get_clock().now().nanoseconds / 1e9
+
     def refuse(self, topic: str, refusal: Refused) -> None:
         """Counts a refused message; the first one for each topic and reason is also logged."""
         self._refusals[topic, refusal.reason] += 1
