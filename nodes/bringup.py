@@ -18,7 +18,7 @@ from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
 from dae_ros.errors import SettingsError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.report.summary import Summary
-from dae_ros.ros.graph import find_task_file, read_settings
+from dae_ros.ros.graph import find_task_file, read_settings, training_graph
 from dae_ros.run_folder import RunFolder
 from dae_ros.worlds import world_spec
 
@@ -39,7 +39,8 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--in-process', action='store_true', help='the same run, bit for bit, in this process without ROS')
     parser.add_argument('--execute', metavar='POLICY', help='drive robots with a trained team: a policy file, the name of one '
                                                             'that comes with the package, or parameter_server for what that has')
-    parser.add_argument('--simulate', action='store_true', help='with --execute: our simulator plays the robots')
+    parser.add_argument('--stream', action='store_true', help='train with robots that act at their own rate')
+    parser.add_argument('--simulate', action='store_true', help='with --execute or --stream: our simulator plays the robots')
     return parser.parse_args(arguments)
 
 
@@ -66,7 +67,30 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, displa
     """The run as separate processes. Raises DaeRosError when it cannot go on."""
     from dae_ros.ros.graph_run import GraphRun
 
-    GraphRun(settings, folder, namespace, display).run()
+    GraphRun(settings, folder, namespace, display, training_graph(settings, folder)).run()
+
+
+def train_on_robots(arguments: argparse.Namespace, folder: RunFolder, display: ProgressDisplay) -> None:
+    """The run as a stream of what robots do. Raises DaeRosError when it cannot go on."""
+    from dae_ros.ros.execution import read_values, run_settings, streaming_graph
+    from dae_ros.ros.graph_run import GraphRun
+
+    values = read_values(task_file_of(arguments), arguments.parameter)
+    settings = run_settings(values)
+    GraphRun(settings, folder, arguments.namespace, display, streaming_graph(settings, values, folder, arguments.simulate)).run()
+
+
+def task_file_of(arguments: argparse.Namespace) -> Path | None:
+    return find_task_file(arguments.task_file) if arguments.task_file else None
+
+
+def read_run_settings(task_file: Path | None, arguments: argparse.Namespace) -> Settings:
+    """The settings of the training; where robots take part, theirs may stand among them."""
+    if not arguments.stream:
+        return read_settings(task_file, arguments.parameter)
+    from dae_ros.ros.execution import read_values, run_settings
+
+    return run_settings(read_values(task_file, arguments.parameter))
 
 
 def execute(arguments: argparse.Namespace) -> None:
@@ -74,7 +98,7 @@ def execute(arguments: argparse.Namespace) -> None:
     from dae_ros.ros.execution import execution_graph, find_policy, read_values, write_values
     from dae_ros.ros.execution_run import ExecutionRun
 
-    values = read_values(find_task_file(arguments.task_file) if arguments.task_file else None, arguments.parameter)
+    values = read_values(task_file_of(arguments), arguments.parameter)
     folder = arguments.run_folder or Path('runs') / f'execution-{datetime.now():%Y%m%d-%H%M%S}'
     processes = execution_graph(values, find_policy(arguments.execute), arguments.simulate)
     print(f'driving; Ctrl-C stops the robots (logs of the nodes in {folder / "logs"})', flush=True)
@@ -84,8 +108,8 @@ def execute(arguments: argparse.Namespace) -> None:
 
 def bring_up(arguments: argparse.Namespace) -> int:
     """The run that the arguments describe, or this process's part of its learning. The exit code."""
-    if arguments.simulate and not arguments.execute:
-        raise SettingsError('--simulate goes with --execute POLICY')
+    if arguments.simulate and not (arguments.execute or arguments.stream):
+        raise SettingsError('--simulate goes with --execute POLICY or --stream')
     if arguments.execute:
         execute(arguments)
         return 0
@@ -94,14 +118,16 @@ def bring_up(arguments: argparse.Namespace) -> int:
 
         help_to_learn()
         return 0
-    task_file = find_task_file(arguments.task_file) if arguments.task_file else None
-    settings = read_settings(task_file, arguments.parameter)
+    task_file = task_file_of(arguments)
+    settings = read_run_settings(task_file, arguments)
     stem = task_file.stem if task_file else settings.task.task.replace(':', '_')
     path = arguments.run_folder or Path('runs') / f'{stem}-{datetime.now():%Y%m%d-%H%M%S}'
     folder = RunFolder(path, settings)
     with ProgressDisplay() as display:
         display.note(f'training in {path} (logs of the nodes in {path / "logs"})')
-        if arguments.in_process:
+        if arguments.stream:
+            train_on_robots(arguments, folder, display)
+        elif arguments.in_process:
             train_in_process(settings, folder, display)
         else:
             train_on_graph(settings, folder, arguments.namespace, display)

@@ -29,6 +29,8 @@ class StreamTrainerNode(TrainerNode):
         steps = TaskMonitor(settings.task).episode_steps
         if settings.run.num_steps != steps or settings.task.world_groups != 1:
             raise SettingsError(f'streaming needs num_steps = {steps}, an episode, and world_groups = 1')
+        if settings.run.evaluation_greedy and settings.run.evaluation_episodes:
+            raise SettingsError('in a stream robots draw their actions to the end: set evaluation_greedy to false')
         return StreamAssembler(training.spec, settings.task.num_worlds, steps, training.run, self._more['max_staleness'])
 
     def _listen_to_group(self, group: int) -> GroupInputs:

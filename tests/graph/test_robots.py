@@ -20,6 +20,7 @@ from robots import LANDMARKS, PLACES, POLICY, Processes, Stage, is_standing
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
+from dae_ros.report.summary import Summary
 from dae_ros.robots.acting import ActingEnd
 from dae_ros.ros import convert_robots, names, qos
 from dae_ros.weights.codec import decode_policy
@@ -138,6 +139,7 @@ def test_what_robots_do_does_not_change_when_trainer_and_parameter_server_are_ki
     assert stage.call(Trigger, 'agent_0/activate_policy', Trigger.Request()).message == 'acting with policy version 0'
 
 
+@pytest.mark.slow  # twenty layouts of eight seconds each, at five times real time
 def test_the_navigation_team_covers_the_landmarks_with_foreign_differential_robots(stage, processes):
     """Robots that were never seen, at 10 Hz, with 5 % noise and 50 ms delay; only their clock runs faster than ours."""
     processes.python('robots', 'examples.foreign_robots', '--ros-args', '-p', f'speedup:={SPEEDUP}')
@@ -217,8 +219,8 @@ def test_a_robot_bringup_that_cannot_begin_says_why(domain, tmp_path):
 def test_the_commands_of_the_documentation_drive_a_robot(stage, processes):
     """The agent's and the bridge's, with the service that enables it; bringup's is tried above."""
     commands = ''.join(re.findall(r'```bash\n(.*?)```', (REPOSITORY / 'docs/robots.md').read_text(), re.DOTALL)).splitlines()
-    bringup, agent, bridge, enable = commands
-    assert 'bringup navigation --execute navigation --simulate' in bringup
+    execute, agent, bridge, enable, stream = commands
+    assert 'bringup navigation --execute navigation --simulate' in execute and 'bringup streaming --stream --simulate' in stream
     for name, command in (('agent_0', agent), ('bridge_0', bridge)):
         assert f'__node:={name}' in command
         executable, *arguments = re.sub(r'-r \S+:=/tb3_\S+', '', command).replace('config/', f'{REPOSITORY}/config/').split()
@@ -230,3 +232,18 @@ def test_the_commands_of_the_documentation_drive_a_robot(stage, processes):
     stage.start_driving(0, 0, 1, 2)
     speeds = [abs(stage.drive(0, 0, 1, 2).linear.x) for _ in range(10)]
     assert max(speeds) <= 0.3
+
+
+@pytest.mark.slow  # ten processes, one of them with torch
+def test_a_team_learns_in_a_stream_of_what_its_robots_do(domain, tmp_path):
+    """Their agents and bridges, who watches them, trainer and parameter server."""
+    settings = ['num_worlds:=1', 'total_steps:=50', 'evaluation_episodes:=1', 'epochs:=1', 'reward_network.epochs:=1',
+                'real_time_factor:=3.0']  # a loaded machine loses steps of faster robots
+    command = [sys.executable, '-m', 'dae_ros_nodes.bringup', 'streaming', '--stream', '--simulate', '--run-folder',
+               str(tmp_path / 'run'), *(text for one in settings for text in ('-p', one))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=2 * TIMEOUT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    summary = Summary.read(tmp_path / 'run' / 'summary.json')
+    assert summary.environment_steps == 50 and summary.evaluation_episodes == 1
+    assert summary.policy == 'sampling'
+    assert not processes_naming(str(tmp_path))
