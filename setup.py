@@ -3,7 +3,8 @@ from glob import glob
 
 from setuptools import find_packages, setup
 
-EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'player', 'recorder', 'replay_trainer', 'train_reward', 'trainer', 'world')
+EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'player', 'recorder', 'replay_trainer', 'robot_agent', 'robot_bridge',
+               'robot_world', 'stream_trainer', 'task_monitor', 'train_reward', 'trainer', 'world')
 
 setup(
     name='dae_ros',
@@ -15,6 +16,7 @@ setup(
         ('share/ament_index/resource_index/packages', ['resource/dae_ros']),
         ('share/dae_ros', ['package.xml']),
         ('share/dae_ros/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        ('share/dae_ros/config/policies', sorted(glob('config/policies/*.safetensors'))),
         ('share/dae_ros/config/bags', sorted(glob('config/bags/*.yaml'))),
         ('share/dae_ros/config/sros2', sorted(glob('config/sros2/*.xml'))),
         ('share/dae_ros/launch', sorted(glob('launch/*.py'))),

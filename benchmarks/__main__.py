@@ -1,7 +1,8 @@
 """make bench: what we reach on this machine; kept in benchmarks/results.json and drawn in docs/.
 
 Parts: training (one process, with its phases), graph (beside the single process), learner (arithmetic beside the matrix
-peak), worlds (simulators), inference (one robot); scale (as the work grows) and bags, which take long and must be named.
+peak), worlds (simulators), inference (one robot), execution (the same through its node, over DDS); scale (as the work grows)
+and bags, which take long and must be named.
 """
 
 from __future__ import annotations
@@ -65,9 +66,19 @@ def one_robot(rounds: int) -> dict[str, float]:
     return result
 
 
+def one_agent(rounds: int) -> dict[str, float]:
+    """One robot's agent as a node; needs ROS."""
+    from benchmarks import execution
+
+    result = execution.measure()
+    print(f'  {result["median"]:.2f} ms, 99th percentile {result["percentile_99"]:.2f} ms; round trip '
+          f'{result["round_trip_median"]:.2f} ms, 99th percentile {result["round_trip_percentile_99"]:.2f} ms')
+    return result
+
+
 PARTS: dict[str, Callable[[int], Any]] = {
     'training': training, 'graph': graph, 'learner': lambda rounds: learner.measure(repeats=rounds + 2), 'worlds': simulators,
-    'inference': one_robot, 'scale': lambda rounds: scale.measure(), 'bags': bags.measure}
+    'inference': one_robot, 'execution': one_agent, 'scale': lambda rounds: scale.measure(), 'bags': bags.measure}
 UNASKED = tuple(name for name in PARTS if name not in ('scale', 'bags'))
 
 

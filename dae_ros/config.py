@@ -183,6 +183,63 @@ class AgentSettings:
 
 
 @dataclass(frozen=True)
+class ExecutionSettings:
+    """How a robot's agent acts once the team is trained."""
+
+    policy_file: str = setting('', 'safetensors file with the policy to act with; empty takes what the parameter server has')
+    greedy: bool = setting(True, 'take the most probable action instead of drawing one')
+
+
+@dataclass(frozen=True)
+class BodySettings:
+    """How the task's plane lies in the robots' world, and what a robot of the team can do. Bridges and our own simulator, when
+    it plays the robots, share them."""
+
+    world_frame: str = setting('map', 'frame_id of the odometry and the landmarks of the whole team')
+    control_rate: float = setting(10.0, 'steps of the task per second; the simulated ones have 10. At another rate the policy '
+                                        'lives faster or slower', unit='Hz', minimum=0.1, maximum=1000.0)
+    scale: float = setting(1.0, 'metres that the robots see as one unit of the task', unit='m', minimum=1e-6, maximum=1e6)
+    origin_x: float = setting(0.0, 'where the task has its origin in the world frame', unit='m', minimum=-1e9, maximum=1e9)
+    origin_y: float = setting(0.0, 'where the task has its origin in the world frame', unit='m', minimum=-1e9, maximum=1e9)
+    drive: str = setting('differential', 'how the robot moves', choices=('differential', 'holonomic'))
+    max_speed: float = setting(0.5, 'highest speed', unit='m/s', minimum=1e-3, maximum=100.0)
+    max_acceleration: float = setting(2.0, 'highest acceleration; a stop is not limited by it', unit='m/s^2', minimum=1e-3,
+                                      maximum=1000.0)
+    max_turn_rate: float = setting(2.5, 'fastest turning of a differential robot', unit='rad/s', minimum=1e-3, maximum=100.0)
+    max_turn_acceleration: float = setting(10.0, 'highest angular acceleration of a differential robot', unit='rad/s^2',
+                                           minimum=1e-3, maximum=10_000.0)
+    stamped: bool = setting(False, 'cmd_vel is a TwistStamped instead of a Twist')
+
+
+@dataclass(frozen=True)
+class RobotWorldSettings:
+    """How our own simulator plays the robots."""
+
+    real_time_factor: float = setting(1.0, 'seconds simulated per second; other than 1 it publishes /clock, and all others need '
+                                           'use_sim_time', minimum=0.01, maximum=1000.0)
+    odometry_rate: float = setting(20.0, 'odometry per simulated second', unit='Hz', minimum=1.0, maximum=1000.0)
+    reset_episodes: bool = setting(False, 'put robots and landmarks elsewhere whenever an episode begins')
+
+
+@dataclass(frozen=True)
+class BridgeSettings:
+    """What lets a robot move, and what makes it stop."""
+
+    enabled: bool = setting(False, 'whether the robot may move from the start, without the service ~/enable')
+    landmarks: str = setting('', 'where the landmarks are, "x y, x y, ..." in m; empty takes the topic')
+    odometry_timeout: float = setting(0.15, 'the robot stops when its own odometry is older', unit='s', minimum=1e-3,
+                                      maximum=60.0)
+    teammate_hold: float = setting(1.0, 'a team mate counts as where it was last for so long; then the robot stops', unit='s',
+                                   minimum=1e-3, maximum=3600.0)
+    action_timeout: float = setting(0.25, 'the robot stops when its agent does not answer for longer', unit='s', minimum=1e-3,
+                                    maximum=60.0)
+    jump_distance: float = setting(0.3, 'odometry further than this from where the robot can be at jump_speed is refused',
+                                   unit='m', minimum=0.0, maximum=1e6)
+    jump_speed: float = setting(5.0, 'a change of position faster than this is no motion', unit='m/s', minimum=1e-3,
+                                maximum=1e6)
+
+
+@dataclass(frozen=True)
 class ParameterServerSettings:
     """What is particular to the parameter server."""
 
@@ -203,6 +260,14 @@ class RecorderSettings:
     split_seconds: int = setting(0, 'a new bag is begun after this long; 0 for never', unit='s', minimum=0, maximum=1_000_000_000)
     everything: bool = setting(False, 'also record observations and policies, which neither a replay to a trainer nor reward '
                                       'training needs')
+
+
+@dataclass(frozen=True)
+class StreamSettings:
+    """How the trainer takes what robots do at their own rate."""
+
+    max_staleness: int = setting(2, 'updates that the policy of an action may be behind', unit='updates', minimum=0,
+                                 maximum=1_000_000)
 
 
 @dataclass(frozen=True)
@@ -279,6 +344,11 @@ def declarations(*groups: type) -> Iterator[SettingInfo]:
 
 
 SETTINGS: dict[str, SettingInfo] = {info.name: info for info in declarations(*get_type_hints(Settings).values())}
+"""Those of a run, which a task file may set."""
+
+ROBOT_SETTINGS: dict[str, SettingInfo] = {
+    info.name: info for info in declarations(ExecutionSettings, BodySettings, RobotWorldSettings, BridgeSettings, StreamSettings)}
+"""Those of trained teams on robots; a task file may set them too, each node takes its own."""
 
 
 def unknown_setting(name: str, known: Mapping[str, Any] | tuple[str, ...]) -> SettingsError:

@@ -53,6 +53,8 @@ class Refused(DaeRosError):
     OVERSIZED = 'oversized'
     CORRUPT = 'corrupt'
     FORGED = 'forged'
+    WRONG_FRAME = 'wrong_frame'
+    JUMP = 'jump'
 
     def __init__(self, reason: str, detail: str):
         super().__init__(f'{reason}: {detail}')

@@ -1,7 +1,8 @@
-"""bringup: trains a team from one task file: starts the whole graph, shows its progress, and stops it again.
+"""bringup: trains a team from one task file, or drives robots with it: starts the whole graph, and stops it again.
 
     ros2 run dae_ros bringup navigation -p seed:=2
     ros2 run dae_ros bringup config/navigation.yaml --in-process
+    ros2 run dae_ros bringup navigation --execute runs/mine/policy.safetensors
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from typing import TYPE_CHECKING
 
 from dae_ros import torchrun
 from dae_ros.command import interrupt_once, run_command
-from dae_ros.config import SETTINGS, Settings
+from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
+from dae_ros.errors import SettingsError
 
 if TYPE_CHECKING:
     from dae_ros.report.progress import ProgressDisplay
@@ -22,9 +24,11 @@ if TYPE_CHECKING:
 
 
 def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
-    settings_help = '\n'.join(f'  {info.name} := {info.default!r}  {info.describe()}' for info in SETTINGS.values())
+    settings_help, robots_help = ('\n'.join(f'  {info.name} := {info.default!r}  {info.describe()}' for info in group.values())
+                                  for group in (SETTINGS, ROBOT_SETTINGS))
     parser = argparse.ArgumentParser(prog='bringup', description=__doc__.split('\n')[0].removeprefix('bringup: '),
-                                     epilog=f'settings (in the task file, or with -p):\n{settings_help}',
+                                     epilog=f'settings (in the task file, or with -p):\n{settings_help}\n\n'
+                                            f'with --execute also:\n{robots_help}',
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('task_file', nargs='?', help='a task file, or the name of one that comes with the package, such as '
                                                      'navigation; without one every setting has its default')
@@ -35,6 +39,10 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--key-file', default='', help='file with the key that the team signs its policies with; without one '
                                                        'they are not signed')
     parser.add_argument('--in-process', action='store_true', help='the same run, bit for bit, in this process without ROS')
+    parser.add_argument('--execute', metavar='POLICY', help='drive robots with a trained team: a policy file, the name of one '
+                                                            'that comes with the package, or parameter_server for what that has')
+    parser.add_argument('--stream', action='store_true', help='train with robots that act at their own rate')
+    parser.add_argument('--simulate', action='store_true', help='with --execute or --stream: our simulator plays the robots')
     return parser.parse_args(arguments)
 
 
@@ -59,13 +67,59 @@ def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDis
 
 def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, key_file: str, display: ProgressDisplay) -> None:
     """The run as separate processes. Raises DaeRosError when it cannot go on."""
+    from dae_ros.ros.graph import training_graph
     from dae_ros.ros.graph_run import GraphRun
 
-    GraphRun(settings, folder, namespace, key_file, display).run()
+    GraphRun(settings, folder, namespace, display, training_graph(settings, folder, key_file)).run()
+
+
+def train_on_robots(arguments: argparse.Namespace, folder: RunFolder, display: ProgressDisplay) -> None:
+    """The run as a stream of what robots do. Raises DaeRosError when it cannot go on."""
+    from dae_ros.ros.execution import read_values, run_settings, streaming_graph
+    from dae_ros.ros.graph_run import GraphRun
+
+    values = read_values(task_file_of(arguments), arguments.parameter)
+    settings = run_settings(values)
+    GraphRun(settings, folder, arguments.namespace, display, streaming_graph(settings, values, folder, arguments.simulate)).run()
+
+
+def task_file_of(arguments: argparse.Namespace) -> Path | None:
+    from dae_ros.ros.graph import find_task_file
+
+    return find_task_file(arguments.task_file) if arguments.task_file else None
+
+
+def read_run_settings(task_file: Path | None, arguments: argparse.Namespace) -> Settings:
+    """The settings of the training; where robots take part, theirs may stand among them."""
+    if not arguments.stream:
+        from dae_ros.ros.graph import read_settings
+
+        return read_settings(task_file, arguments.parameter)
+    from dae_ros.ros.execution import read_values, run_settings
+
+    return run_settings(read_values(task_file, arguments.parameter))
+
+
+def execute(arguments: argparse.Namespace) -> None:
+    """Drives robots until Ctrl-C."""
+    from dae_ros.ros.execution import execution_graph, find_policy, read_values, write_values
+    from dae_ros.ros.execution_run import ExecutionRun
+
+    values = read_values(task_file_of(arguments), arguments.parameter)
+    folder = arguments.run_folder or Path('runs') / f'execution-{datetime.now():%Y%m%d-%H%M%S}'
+    processes = execution_graph(values, find_policy(arguments.execute), arguments.simulate)
+    print(f'driving; Ctrl-C stops the robots (logs of the nodes in {folder / "logs"})', flush=True)
+    settings_file = write_values(values, folder / 'settings.yaml')
+    ExecutionRun(processes, settings_file, arguments.namespace, lambda line: print(line, flush=True)).run()
 
 
 def bring_up(arguments: argparse.Namespace) -> int:
     """The run that the arguments describe, or this process's part of its learning. The exit code."""
+    if arguments.simulate and not (arguments.execute or arguments.stream):
+        raise SettingsError('--simulate goes with --execute POLICY or --stream')
+    if arguments.execute:
+        execute(arguments)
+        return 0
     if torchrun.rank() > 0:
         from dae_ros.learning.distributed import help_to_learn
 
@@ -74,17 +128,18 @@ def bring_up(arguments: argparse.Namespace) -> int:
     # Here, because it takes a second in which Ctrl-C is to be heard.
     from dae_ros.report.progress import ProgressDisplay
     from dae_ros.report.summary import Summary
-    from dae_ros.ros.graph import find_task_file, read_settings
     from dae_ros.run_folder import RunFolder
 
-    task_file = find_task_file(arguments.task_file) if arguments.task_file else None
-    settings = read_settings(task_file, arguments.parameter)
+    task_file = task_file_of(arguments)
+    settings = read_run_settings(task_file, arguments)
     stem = task_file.stem if task_file else settings.task.task.replace(':', '_')
     path = arguments.run_folder or Path('runs') / f'{stem}-{datetime.now():%Y%m%d-%H%M%S}'
     folder = RunFolder(path, settings)
     with ProgressDisplay() as display:
         display.note(f'training in {path} (logs of the nodes in {path / "logs"})')
-        if arguments.in_process:
+        if arguments.stream:
+            train_on_robots(arguments, folder, display)
+        elif arguments.in_process:
             train_in_process(settings, folder, display)
         else:
             train_on_graph(settings, folder, arguments.namespace, arguments.key_file, display)

@@ -21,6 +21,7 @@ from dae_ros.config import (
     LearnerSettings,
     RewardNetworkSettings,
     RunSettings,
+    SettingInfo,
     TaskSettings,
     TeamKey,
     TrainerSettings,
@@ -57,9 +58,11 @@ class GroupInputs(NamedTuple):
 class TrainingNode(TeamNode):
     """A `Training` that sends out its policy and its status. Subclasses say where its rollouts come from."""
 
-    def __init__(self, name: str):
-        super().__init__(name, declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings, TrainerSettings,
-                                            TeamKey))
+    def __init__(self, name: str, *more: SettingInfo):
+        """`more` settings are for subclasses."""
+        super().__init__(name, [*declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings, TrainerSettings,
+                                              TeamKey), *more])
+        self._more = {info.name: self.settings.pop(info.name) for info in more}
         folder = self.settings.pop('run_folder')
         self._key = team_key(self, self.settings.pop('key_file'))
         settings = from_flat(self.settings)
@@ -123,14 +126,13 @@ class TrainingNode(TeamNode):
 class TrainerNode(TrainingNode):
     """Wires a `GroupedAssembler` to its topics. Learning happens in the callback of the last datum."""
 
-    def __init__(self):
-        super().__init__('trainer')
+    def __init__(self, *more: SettingInfo):
+        super().__init__('trainer', *more)
         training, settings = self._training, self._training.settings
-        task = settings.task
-        self._assembler = GroupedAssembler(training.spec, task.worlds_per_group, task.world_groups)
+        self._assembler = self._make_assembler()
         self._paused = False
         self._request = self.publisher(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED)
-        self._groups = [self._listen_to_group(group) for group in range(task.world_groups)]
+        self._groups = [self._listen_to_group(group) for group in range(settings.task.world_groups)]
         self.create_service(Trigger, names.PAUSE, self._on_pause)
         self.create_service(Trigger, names.RESUME, self._on_resume)
         self.listen(Status, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
@@ -144,6 +146,10 @@ class TrainerNode(TrainingNode):
         self.every(min(SHORT_PATIENCE, settings.run.rollout_timeout) / 4, self._begin_anew_if_silent)
         self._publish_policy()
         self._advance()
+
+    def _make_assembler(self):
+        task = self._training.settings.task
+        return GroupedAssembler(self._training.spec, task.worlds_per_group, task.world_groups)
 
     def _listen_to_group(self, group: int) -> GroupInputs:
         """What comes on a group's topics goes to its assembler and to no other."""

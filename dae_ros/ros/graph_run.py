@@ -22,7 +22,7 @@ from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.restarts import Restarts, SignsOfLife, describe
 from dae_ros.ros import names, qos, shared_memory
-from dae_ros.ros.graph import enclave_arguments, node_environment, training_graph
+from dae_ros.ros.graph import NodeProcess, enclave_arguments, node_environment
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 
@@ -35,11 +35,12 @@ STATES = {getattr(TrainingStatus, name): name.lower() for name in
 class GraphRun:
     """One run of a team in a namespace. What happens to it becomes a call in `run`'s thread, one after the other."""
 
-    def __init__(self, settings: Settings, folder: RunFolder, namespace: str, key_file: str, display: ProgressDisplay):
+    def __init__(self, settings: Settings, folder: RunFolder, namespace: str, display: ProgressDisplay,
+                 processes: list[NodeProcess]):
         self._folder = folder
         self._namespace = namespace
         self._display = display
-        self._processes = {process.name: process for process in training_graph(settings, folder, key_file)}
+        self._processes = {process.name: process for process in processes}
         # The processes that torchrun started learn with the trainer they found, and with no other.
         self._restarts = Restarts(settings.run.max_restarts if torchrun.size() == 1 else 0)
         self._signs = SignsOfLife(settings.run.silence_timeout)

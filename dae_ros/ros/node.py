@@ -69,6 +69,7 @@ class TeamNode(Node):
         self.settings: dict[str, Any] = params.declare(self, declared)
         self.done = False
         self.busy = False  # whether a callback is at work
+        self.is_in_trouble = False  # whether diagnostics warn; `diagnose` may set it
         self.failure: BaseException | None = None  # what a callback raised; ends the node
         self._refusals: Counter[tuple[str, str]] = Counter()
         self._diagnostics = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.EVENTS)
@@ -118,6 +119,10 @@ class TeamNode(Node):
 
         return call
 
+    def now(self) -> float:
+        """The time of this node's clock [s]; 0 before simulated time has begun."""
+        return self.get_clock().now().nanoseconds / 1e9
+
     def refuse(self, topic: str, refusal: Refused) -> None:
         """Counts a refused message; the first one for each topic and reason is also logged."""
         self._refusals[topic, refusal.reason] += 1
@@ -138,7 +143,7 @@ class TeamNode(Node):
         """Publishes the node's state and the counts of refused messages."""
         message, values = self.diagnose()
         values |= {f'refused {topic} {reason}': count for (topic, reason), count in sorted(self._refusals.items())}
-        level = DiagnosticStatus.WARN if self._refusals else DiagnosticStatus.OK
+        level = DiagnosticStatus.WARN if self._refusals or self.is_in_trouble else DiagnosticStatus.OK
         status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=message,
                                   values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
         report = DiagnosticArray(status=[status])

@@ -7,7 +7,7 @@ from typing import Any, Iterable, Mapping
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from dae_ros.config import SETTINGS, SettingInfo, unknown_setting
+from dae_ros.config import ROBOT_SETTINGS, SETTINGS, SettingInfo, unknown_setting
 
 BUILT_IN = ('use_sim_time', 'start_type_description_service')
 
@@ -20,17 +20,17 @@ def declare(node: Node, declared: Iterable[SettingInfo]) -> dict[str, Any]:
     setting of another node's is fine, since one task file serves all nodes. Raises SettingsError.
     """
     declared = {info.name: info for info in declared}
+    known = {**SETTINGS, **ROBOT_SETTINGS, **declared}
     overrides = _take_overrides(node)
     for name in overrides:
-        if name not in declared and name not in SETTINGS:
-            raise unknown_setting(name, {**SETTINGS, **declared})
+        if name not in known:
+            raise unknown_setting(name, known)
     values = {}
     for name, info in declared.items():
         values[name] = info.check(overrides.get(name, info.default))
         node.declare_parameter(name, values[name], _descriptor(info), ignore_override=True)
     for name, value in overrides.items():
-        if name in SETTINGS:
-            SETTINGS[name].check(value)
+        known[name].check(value)
     return values
 
 

@@ -24,6 +24,13 @@ ROLLOUT = _reliable(1024, DurabilityPolicy.VOLATILE)
 EVENTS = _reliable(10, DurabilityPolicy.VOLATILE)
 """A few messages now and then: diagnostics."""
 
+SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5, reliability=ReliabilityPolicy.BEST_EFFORT,
+                    durability=DurabilityPolicy.VOLATILE)
+"""Odometry: only the newest counts, and whoever publishes it may be reliable or not."""
+
+NEWEST = _reliable(1, DurabilityPolicy.VOLATILE)
+"""For publishers of what soon has a successor, such as velocity commands: others may listen reliably or not."""
+
 RECORDED = _reliable(8192, DurabilityPolicy.VOLATILE)
 """For the recorder, whom nobody waits for: data queue up while the disk is slow."""
 

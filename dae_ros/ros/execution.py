@@ -1,0 +1,80 @@
+"""The processes of a team on robots, described once: agents and bridges, our simulator in the robots' place, and who trains."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Iterable, Mapping
+
+import yaml
+
+from dae_ros import config
+from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
+from dae_ros.errors import SettingsError
+from dae_ros.robots.setup import task_settings
+from dae_ros.ros.graph import NodeProcess, shipped_config, training_graph
+from dae_ros.run_folder import RunFolder
+
+KNOWN = {**SETTINGS, **ROBOT_SETTINGS}
+NEEDED = {'seed', *(name for name, info in SETTINGS.items() if info.group == 'task'), *ROBOT_SETTINGS}
+FROM_SERVER = 'parameter_server'  # in place of a file: whatever the parameter server has
+
+
+def read_values(task_file: Path | None, overrides: Iterable[str]) -> dict[str, Any]:
+    """The task file's values with the `name:=value` overrides put in, by name, checked. Raises SettingsError."""
+    values = config.load_task_file(task_file) if task_file else {}
+    values.update(config.parse_override(text) for text in overrides)
+    for name in values:
+        if name not in KNOWN:
+            raise config.unknown_setting(name, KNOWN)
+    return {name: KNOWN[name].check(value) for name, value in values.items()}
+
+
+def run_settings(values: Mapping[str, Any]) -> Settings:
+    """Those of them that a training has."""
+    return config.from_flat({name: value for name, value in values.items() if name in SETTINGS})
+
+
+def find_policy(name: str) -> str:
+    """The file, or that of this name in the package's config/policies; '' for the parameter server's. Raises SettingsError."""
+    if name == FROM_SERVER:
+        return ''
+    for path in (Path(name), shipped_config() / 'policies' / f'{name}.safetensors'):
+        if path.is_file():
+            return str(path.resolve())
+    raise SettingsError(f'there is no policy file {name}')
+
+
+def execution_graph(values: dict[str, Any], policy_file: str, simulate: bool) -> list[NodeProcess]:
+    """An agent and a bridge for each robot; with `simulate` also the robots, which may then move from the start."""
+    robots = range(task_settings(values).num_agents)
+    own_clock = clock_parameters(values, simulate)
+    policy = {'policy_file': policy_file} if policy_file else {}
+    bridge = {'enabled': values.get('enabled', simulate), **own_clock}
+    return [*([NodeProcess('robot_world', 'robot_world', {})] if simulate else []),
+            *(NodeProcess('robot_agent', f'agent_{robot}', {'robot': robot, **policy, **own_clock}) for robot in robots),
+            *(NodeProcess('robot_bridge', f'bridge_{robot}', {'robot': robot, **bridge}) for robot in robots)]
+
+
+def streaming_graph(settings: Settings, values: dict[str, Any], folder: RunFolder, simulate: bool) -> list[NodeProcess]:
+    """The same with who learns from it: parameter server, trainer and task monitor. Agents draw their actions."""
+    server, trainer = training_graph(settings, folder)[-2:]
+    monitor = NodeProcess('task_monitor', 'task_monitor', clock_parameters(values, simulate))
+    more = {'robot_world': {}, 'robot_agent': {'run': folder.run, 'greedy': False}, 'robot_bridge': {'run': folder.run},
+            'task_monitor': {'run': folder.run}}
+    robots = {name: value for name, value in values.items() if name in ROBOT_SETTINGS}  # not in the run's settings file
+    return [server, trainer._replace(executable='stream_trainer', parameters={**trainer.parameters, **robots}),
+            *(process._replace(parameters={**robots, **process.parameters, **more[process.executable]})
+              for process in (monitor, *execution_graph(values, '', simulate)))]
+
+
+def clock_parameters(values: dict[str, Any], simulate: bool) -> dict[str, Any]:
+    """What nodes need to go by the simulator's clock, where that is not the system's."""
+    return {'use_sim_time': True} if simulate and values.get('real_time_factor', 1.0) != 1.0 else {}
+
+
+def write_values(values: dict[str, Any], path: Path) -> Path:
+    """A parameter file with those of these values that some node on robots has."""
+    values = {name: value for name, value in values.items() if name in NEEDED}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}, sort_keys=False), encoding='utf-8')
+    return path

@@ -1,0 +1,136 @@
+"""robot_bridge: lets the agent of one robot drive it: odometry to observation, action to cmd_vel, and a stop when in doubt.
+
+    ros2 run dae_ros robot_bridge --ros-args -p robot:=0 -p task:=navigation -r robot_0/cmd_vel:=/tb3_0/cmd_vel
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from functools import partial
+
+import rclpy
+from dae_ros_msgs import msg
+from geometry_msgs.msg import PoseArray, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
+from std_srvs.srv import SetBool
+
+from dae_ros.config import AgentSettings, BodySettings, BridgeSettings, RunBinding, TaskSettings, declarations
+from dae_ros.errors import Refused, SettingsError
+from dae_ros.robots.motion import STOP, Command
+from dae_ros.robots.pilot import LOOKS, Turn
+from dae_ros.robots.safety import Stop
+from dae_ros.robots.setup import landmarks_in, make_pilot
+from dae_ros.ros import convert, convert_robots, names, qos
+from dae_ros.ros.node import TeamNode, run
+
+LAST_WORD = Duration(seconds=0.5)  # for the last command to arrive
+
+
+class RobotBridgeNode(TeamNode):
+    """Wires a `Pilot` to the topics of its robot and the team's odometry."""
+
+    def __init__(self):
+        super().__init__('robot_bridge', declarations(AgentSettings, TaskSettings, BodySettings, BridgeSettings, RunBinding))
+        settings = self.settings
+        robot, self._world_frame, self._stamped = settings['robot'], settings['world_frame'], settings['stamped']
+        self._body_frame = ''
+        self._sending, self._ended = threading.Lock(), False
+        self._pilot = make_pilot(settings)
+        self._commands = self.publisher(TwistStamped if self._stamped else Twist, names.COMMAND.format(robot), qos.NEWEST)
+        self._observations = self.publisher(msg.Observation, names.OBSERVATION.format(robot), qos.LATCHED)
+        for other in range(settings['num_agents']):
+            self.listen(Odometry, names.ODOMETRY.format(other), qos.SENSOR, partial(self._on_odometry, other))
+        if settings['landmarks']:
+            self._take_landmarks(settings['landmarks'])
+        else:
+            self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
+        self.listen(msg.Action, names.ACTION.format(robot), qos.EVENTS, self._on_action)
+        self.create_service(SetBool, names.ENABLE, self._on_enable)
+        self.every(1.0 / (LOOKS * settings['control_rate']), self._look)
+
+    def end(self) -> None:
+        """Tells the robot to stand, as the last thing said; from whichever thread ends the node."""
+        self._send(STOP)
+        with self._sending:
+            self._ended = True
+        self._commands.wait_for_all_acked(LAST_WORD)
+
+    def _on_odometry(self, robot: int, message: Odometry) -> None:
+        now = self.now()
+        if now == 0.0:  # simulated time has not begun
+            return
+        self._pilot.on_odometry(robot, convert_robots.odometry(message, self._world_frame), now)
+        if robot == self.settings['robot']:
+            self._body_frame = message.child_frame_id
+
+    def _on_landmarks(self, message: PoseArray) -> None:
+        self._pilot.on_landmarks(convert_robots.landmarks(message, self._world_frame))
+
+    def _take_landmarks(self, text: str) -> None:
+        try:
+            self._pilot.on_landmarks(landmarks_in(text))
+        except Refused as refusal:
+            raise SettingsError(f'landmarks: {refusal.detail}') from refusal
+
+    def _on_action(self, message: msg.Action) -> None:
+        self._send(self._pilot.on_action(convert.action(message)))
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._pilot.enable(request.data)
+        self._look()
+        stop = self._pilot.stop
+        response.success, response.message = True, 'driving' if stop is None else f'standing: {stop.detail}'
+        return response
+
+    def _look(self) -> None:
+        before = self._pilot.stop
+        turn: Turn = self._pilot.look(self.now())
+        if turn.command is not None:
+            self._send(turn.command)
+        if turn.observation is not None:
+            self._observations.publish(convert.observation_message(turn.observation))
+        stop = self._pilot.stop
+        if (stop and stop.reason) != (before and before.reason):
+            self.get_logger().info('driving' if stop is None else f'standing: {stop.detail}')
+            self.publish_diagnostics()
+
+    def _send(self, command: Command) -> None:
+        message = convert_robots.command_message(command, self._stamped, self.now(), self._body_frame)
+        with self._sending:
+            if not self._ended:
+                self._commands.publish(message)
+
+    def diagnose(self):
+        stop, values = self._pilot.stop, {'robot': self.settings['robot'], 'enabled': self._pilot.enabled}
+        self.is_in_trouble = stop is not None and stop.reason != Stop.DISABLED
+        return ('driving', values) if stop is None else (f'standing: {stop.detail}', {**values, 'standing for': stop.reason})
+
+    def close(self) -> None:
+        if self.context.ok():
+            self.end()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Runs the bridge. Signals end it through a thread of its own, since a context that a signal shut down sends nothing more."""
+    nodes: list[RobotBridgeNode] = []
+    endings = {signal.SIGINT, signal.SIGTERM}
+    signal.pthread_sigmask(signal.SIG_BLOCK, endings)
+
+    def make() -> RobotBridgeNode:
+        nodes.append(RobotBridgeNode())
+        threading.Thread(target=end_on_signal, daemon=True).start()
+        return nodes[0]
+
+    def end_on_signal() -> None:
+        signal.sigwait(endings)
+        nodes[0].end()
+        rclpy.try_shutdown()
+
+    return run(make, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,115 @@
+"""robot_world: our simulator as the robots of one team: odometry, tf, landmarks and markers out, cmd_vel in.
+
+    ros2 run dae_ros robot_world --ros-args -p task:=navigation -p num_agents:=3
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+
+from geometry_msgs.msg import PoseArray, TransformStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock as SystemClock
+from rclpy.clock import ClockType
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from dae_ros.config import SETTINGS, BodySettings, RobotWorldSettings, TaskSettings, declarations
+from dae_ros.robots.bodies import Bodies
+from dae_ros.robots.pilot import stamp_at
+from dae_ros.robots.setup import limits_in, task_frame, task_settings
+from dae_ros.ros import convert_robots, names, qos
+from dae_ros.ros.markers import markers
+from dae_ros.ros.node import TeamNode, run
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # the wheels lack it
+    TFMessage = None
+
+MARKERS_PERIOD = 0.1  # s of simulated time
+BEGINNING = 1.0       # s, where a clock of our own begins
+
+
+class RobotWorldNode(TeamNode):
+    """Wires `Bodies` to the topics of robots. At real time it goes by the system's clock, else it is the clock."""
+
+    def __init__(self):
+        super().__init__('robot_world', [*declarations(TaskSettings, BodySettings, RobotWorldSettings), SETTINGS['seed']])
+        settings, task = self.settings, task_settings(self.settings)
+        self._frame, self._world_frame, robots = task_frame(settings), settings['world_frame'], range(task.num_agents)
+        self._bodies = Bodies(task, self._frame, limits_in(settings), settings['drive'] == 'differential', settings['seed'])
+        self._episode, self._period = 0, 1.0 / settings['odometry_rate']
+        self._is_clock = settings['real_time_factor'] != 1.0
+        self._time, self._shown = BEGINNING, 0.0
+        command = TwistStamped if settings['stamped'] else Twist
+        self._odometry = [self.publisher(Odometry, names.ODOMETRY.format(i), qos.NEWEST) for i in robots]
+        self._landmarks = self.publisher(PoseArray, names.LANDMARKS, qos.LATCHED)
+        self._markers = self.publisher(MarkerArray, names.MARKERS, qos.NEWEST)
+        self._clock_out = self.publisher(Clock, names.CLOCK, qos.NEWEST) if self._is_clock else None
+        self._transforms = TFMessage and self.publisher(TFMessage, names.TRANSFORMS, qos.EVENTS)
+        for i in robots:
+            self.listen(command, names.COMMAND.format(i), qos.SENSOR, partial(self._on_command, i))
+        self.create_service(Trigger, names.NEXT_EPISODE, self._on_next_episode)
+        self._show_landmarks()
+        steady = SystemClock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(self._period / settings['real_time_factor'], self._guarded(self._tick), clock=steady)
+
+    def now(self) -> float:
+        return self._time if self._is_clock else super().now()
+
+    def _on_command(self, robot: int, message: Twist | TwistStamped) -> None:
+        self._bodies.obey(robot, convert_robots.command(message), self.now())
+
+    def _on_next_episode(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._begin(self._episode + 1)
+        response.success, response.message = True, f'episode {self._episode}'
+        return response
+
+    def _begin(self, episode: int) -> None:
+        self._episode = episode
+        self._bodies.place(episode)
+        self._show_landmarks()
+
+    def _show_landmarks(self) -> None:
+        self._landmarks.publish(convert_robots.landmarks_message(self._bodies.landmarks, self.now(), self._world_frame))
+
+    def _tick(self) -> None:
+        self._time = round(self._time + self._period, 6)
+        now = self.now()
+        if self.settings['reset_episodes']:
+            episode = stamp_at(now, 1.0 / self.settings['control_rate'], self._bodies.episode_steps, 0).rollout
+            if episode != self._episode:
+                self._begin(episode)
+        self._bodies.move(now, self._period)
+        if self._is_clock:
+            self._clock_out.publish(Clock(clock=convert_robots.time_message(now)))
+        for robot, publisher in enumerate(self._odometry):
+            publisher.publish(convert_robots.odometry_message(self._bodies.pose(robot, now), float(self._bodies.turns[robot]),
+                                                              self._world_frame, self._body_frame(robot)))
+        if self._transforms:
+            self._transforms.publish(TFMessage(transforms=[self._transform(robot, now) for robot in range(len(self._odometry))]))
+        if not 0.0 <= now - self._shown < MARKERS_PERIOD:
+            self._shown = now
+            self._markers.publish(markers(self._bodies, now, self._world_frame))
+
+    def _body_frame(self, robot: int) -> str:
+        """Two teams have frames of their own, as they have topics of their own."""
+        return f'{self.get_namespace()}/robot_{robot}/base_link'.lstrip('/')
+
+    def _transform(self, robot: int, now: float) -> TransformStamped:
+        pose = self._bodies.pose(robot, now)
+        return convert_robots.transform_message(pose, self._world_frame, self._body_frame(robot))
+
+    def diagnose(self):
+        return 'simulating', {'episode': self._episode, 'tf': 'published' if self._transforms else 'not published: no tf2_msgs'}
+
+
+def main(args: list[str] | None = None) -> int:
+    return run(RobotWorldNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
