@@ -13,7 +13,7 @@ from dae_ros.learning.policy import Policy, PolicyArchitecture
 from dae_ros.rollout.assembler import Assembler
 from dae_ros.rollout.in_process import InProcessCollector
 from dae_ros.rollout.lockstep import AgentEnd, WorldEnd
-from dae_ros.types import Action, JointState, Observation, RolloutRequest, SharedReward, Trajectory, WorldSpec
+from dae_ros.types import Action, JointState, Observation, RolloutRequest, SharedReward, WorldSpec
 from dae_ros.worlds.base import JointObservation, Transition, Worlds
 
 T, W, N, A, O, S = 4, 3, 2, 3, 2, 5

@@ -5,6 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
+from dae_ros import draws
+from dae_ros.errors import Refused
+from dae_ros.learning import advantages
+from dae_ros.rollout.assembler import Assembler
+from dae_ros.rollout.in_process import InProcessCollector
+from dae_ros.rollout.lockstep import AgentEnd, WorldEnd
+from dae_ros.types import Action, JointState, Observation, SharedReward
 from tests.test_learner import (  # noqa: F401
     COMA,
     LEARNER,
@@ -17,15 +25,7 @@ from tests.test_learner import (  # noqa: F401
     random_trajectory,
     state_of,
 )
-from tests.test_lockstep import REQUEST, VERSION, A, Drifting, N, POLICY, T, W, assert_same, refused, stamped
-
-from dae_ros import draws
-from dae_ros.errors import Refused
-from dae_ros.learning import advantages
-from dae_ros.rollout.assembler import Assembler
-from dae_ros.rollout.in_process import InProcessCollector
-from dae_ros.rollout.lockstep import AgentEnd, WorldEnd
-from dae_ros.types import Action, JointState, Observation, SharedReward
+from tests.test_lockstep import POLICY, REQUEST, VERSION, A, Drifting, N, W, assert_same, refused, stamped
 
 LONG = REQUEST._replace(num_steps=24)
 

@@ -71,7 +71,8 @@ def to_chunks(sequences: Tensor, length: int) -> Tensor:
 
 def agent_weights(data: Trajectory) -> Tensor:
     """[T, W, N] what each agent's steps count in the losses: 1, and 0 once it has left."""
-    return torch.ones_like(data.actions, dtype=data.rewards.dtype) if data.present is None else data.present.to(data.rewards.dtype)
+    present = torch.ones_like(data.actions) if data.present is None else data.present
+    return present.to(data.rewards.dtype)
 
 
 def first_states(states: Tensor, length: int) -> Tensor:

@@ -14,7 +14,6 @@ from torch.nn import functional
 
 from dae_ros.learning.kernels import LossTerms
 
-
 _UNAVAILABLE = -1e10  # a logit whose probability is exactly 0, and that times its logarithm, too
 
 
