@@ -38,6 +38,13 @@ def episode_returns(trajectory: Trajectory) -> np.ndarray:
     return np.concatenate(returns)
 
 
+def victories(trajectory: Trajectory) -> np.ndarray:
+    """Which of the episodes that ended within the rollout were won, bool in the order of `episode_returns`."""
+    ended = trajectory.terminated | trajectory.truncated
+    won = np.zeros_like(ended) if trajectory.won is None else trajectory.won
+    return won[ended]
+
+
 class Training:
     """The state of a run between rollouts. Resumes from the folder's newest checkpoint if there is one."""
 
@@ -48,6 +55,7 @@ class Training:
         self.run = folder.run
         self.mean_return = math.nan
         self.evaluation: np.ndarray = np.empty(0)
+        self.won = np.empty(0, bool)  # which of the evaluation's episodes; of worlds that have wins
         self._folder = folder
         self._claim = folder.claim()
         self._writer = ThreadPoolExecutor(1, 'checkpoints')
@@ -123,6 +131,7 @@ class Training:
         returns = episode_returns(trajectory)
         if self.evaluating:
             self.evaluation = np.concatenate([self.evaluation, returns])
+            self.won = np.concatenate([self.won, victories(trajectory)])
         else:
             self.mean_return = float(returns.mean()) if len(returns) else math.nan
             self._learn(trajectory)
@@ -157,8 +166,10 @@ class Training:
         self.policy = self._learner.policy
         self._updates += 1
         ended = time.monotonic()
+        won = victories(trajectory)
+        wins = {'win_rate': float(won.mean()) if len(won) else math.nan} if self.spec.has_wins else {}
         self._log.write(self.environment_steps, {
-            'mean_return': self.mean_return, **metrics, 'seconds/collecting': began - self._rollout_began_at,
+            'mean_return': self.mean_return, **wins, **metrics, 'seconds/collecting': began - self._rollout_began_at,
             'seconds/learning': ended - began, 'steps_per_second': self.steps_per_second})
         if self.evaluating:
             self.save()

@@ -7,7 +7,7 @@ is the only place that turns one into the other.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Callable, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ class WorldSpec(NamedTuple):
     observation_size: int    # O
     state_size: int          # S
     state_is_observations: bool  # the state is the N observations one after another (S = N * O)
+    has_wins: bool = False       # episodes are won or lost
 
 
 class Order(NamedTuple):
@@ -57,6 +58,8 @@ class Observation(NamedTuple):
     policy_version: int
     episode_start: np.ndarray  # [W] bool
     values: np.ndarray         # [W, O] float32
+    available: np.ndarray | None = None  # [W, A] bool: actions it may choose, one at least; None: all
+    present: np.ndarray | None = None    # [W] bool: whether it has not left its team; None: it is there everywhere
 
 
 class Action(NamedTuple):
@@ -76,6 +79,8 @@ class JointState(NamedTuple):
     episode_start: np.ndarray  # [W] bool
     observations: np.ndarray   # [W, N, O] float32
     state: np.ndarray          # [W, S] float32
+    available: np.ndarray | None = None  # [W, N, A] bool: actions each robot may choose; None: all
+    present: np.ndarray | None = None    # [W, N] bool: who has not left the team; None: all are there
 
 
 class SharedReward(NamedTuple):
@@ -86,6 +91,7 @@ class SharedReward(NamedTuple):
     terminated: np.ndarray     # [W] bool: ended for good, no bootstrap
     truncated: np.ndarray      # [W] bool: cut off, bootstrap from the final state
     final_states: np.ndarray   # [K, S] float32: last states of the K truncated episodes, in the order of the worlds
+    won: np.ndarray | None = None  # [W] bool: of the episodes that ended, those the team won; None: none
 
 
 class RolloutRequest(NamedTuple):
@@ -126,3 +132,10 @@ class Trajectory(NamedTuple):
     terminated: np.ndarray     # [T, W] bool
     truncated: np.ndarray      # [T, W] bool
     final_states: np.ndarray   # [K, S] float32, in the order of np.argwhere(truncated)
+    available: np.ndarray | None = None  # [T, W, N, A] bool: actions each agent may choose; None: all
+    present: np.ndarray | None = None    # [T, W, N] bool: who has not left the team; None: all are there
+    won: np.ndarray | None = None        # [T, W] bool: episodes that ended with a victory; None: none
+
+    def map(self, change: Callable[[Any], Any]) -> Trajectory:
+        """Every part that is there, changed."""
+        return Trajectory(*(None if part is None else change(part) for part in self))

@@ -92,7 +92,9 @@ def as_message(store, datum, omit_state):
         state = datum.state[:0] if omit_state and datum.state.shape[1] == N * O else datum.state
         return 'joint_state', *make(
             'JointState', stamp=stamp, num_worlds=W, num_agents=N, observation_size=O, state_size=datum.state.shape[1],
-            episode_start=datum.episode_start.astype(np.uint8), observations=datum.observations.ravel(), state=state.ravel())
+            num_actions=0 if datum.available is None else datum.available.shape[2],
+            episode_start=datum.episode_start.astype(np.uint8), observations=datum.observations.ravel(), state=state.ravel(),
+            available=flags(datum.available), present=flags(datum.present))
     if isinstance(datum, Action):
         return f'robot_{datum.robot}/action', *make(
             'Action', stamp=stamp, robot=datum.robot, policy_version=datum.policy_version, num_worlds=len(datum.actions),
@@ -102,4 +104,9 @@ def as_message(store, datum, omit_state):
     return 'shared_reward', *make(
         'SharedReward', stamp=stamp, num_worlds=len(datum.reward), state_size=datum.final_states.shape[1], reward=datum.reward,
         terminated=datum.terminated.astype(np.uint8), truncated=datum.truncated.astype(np.uint8),
-        final_states=datum.final_states.ravel())
+        final_states=datum.final_states.ravel(), won=flags(datum.won))
+
+
+def flags(values):
+    """An optional field of flags."""
+    return np.empty(0, np.uint8) if values is None else values.astype(np.uint8).ravel()

@@ -170,7 +170,7 @@ def chunk(number, length=2, count=3):
     """A rollout's chunks, all full of its number."""
     full = torch.full((length, count, SPEC.num_agents), number)
     return ActionChunks(full[..., :1, None].float(), full[..., 0] > 0, full, full[..., 0].float(),
-                        torch.ones(length, count)), [torch.full((count, 1, 2), float(number))]
+                        torch.ones(length, count, SPEC.num_agents)), [torch.full((count, 1, 2), float(number))]
 
 
 def test_the_replay_draws_from_the_newest_rollouts_and_keeps_their_parts_together():

@@ -87,21 +87,24 @@ def clear_of_jumps(make):
     raise AssertionError('no seed will do')
 
 
-def weights_for(outputs):
-    """Some of them zero, as for filling."""
-    L, C, *_ = outputs.shape
-    weights = (0.1 + uniform(L, C)) * one_of([0.0, 1.0, 1.0, 1.0], L, C)
+def some_weights(*shape):
+    """Some of them zero, as for filling and for agents that have left."""
+    weights = (0.1 + uniform(*shape)) * one_of([0.0, 1.0, 1.0, 1.0], *shape)
     weights[0] = 1
     return weights
 
 
-def policy_loss(outputs, bonus=0.3):
+def policy_loss(outputs, bonus=0.3, masked=False):
     """Of ratios within the clip range and far out of it, on both sides."""
     actions = one_of(range(outputs.shape[-1]), *outputs.shape[:3], seed=3)
+    available = None
+    if masked:
+        available = one_of([True, True, False], *outputs.shape, seed=6).scatter(-1, actions.unsqueeze(-1), True)
+        outputs = outputs.masked_fill(~available, -1e10)
     chosen = torch.log_softmax(outputs, -1).gather(-1, actions.unsqueeze(-1)).squeeze(-1)
     log_ratios = one_of([-0.8, -0.15, 0.0, 0.12, 0.5], *chosen.shape, seed=4) + 0.03 * uniform(*chosen.shape)
-    return losses.PolicyLoss(actions, (chosen - log_ratios).float(), randoms(*chosen.shape, seed=5), weights_for(outputs), 0.2,
-                             bonus)
+    return losses.PolicyLoss(actions, (chosen - log_ratios).float(), randoms(*chosen.shape, seed=5),
+                             some_weights(*chosen.shape), 0.2, bonus, available)
 
 
 def value_loss(outputs):
@@ -109,15 +112,16 @@ def value_loss(outputs):
     values = outputs.flatten(1)
     old = values + one_of([-0.7, -0.1, 0.0, 0.05, 0.6], *values.shape, seed=4)
     targets = values + one_of([-3.0, -0.4, 0.3, 2.5], *values.shape, seed=5) + 0.03 * uniform(*values.shape)
-    return losses.ValueLoss(old.float(), targets.float(), weights_for(outputs), 0.2, 1.0, 0.5)
+    return losses.ValueLoss(old.float(), targets.float(), some_weights(*values.shape), 0.2, 1.0, 0.5)
 
 
 def reward_loss(outputs):
     L, C, N, A = outputs.shape
-    return losses.RewardLoss(one_of(range(A), L, C, N, seed=3), 2 * randoms(L, C, seed=4), weights_for(outputs))
+    return losses.RewardLoss(one_of(range(A), L, C, N, seed=3), 2 * randoms(L, C, seed=4), some_weights(L, C, N))
 
 
-LOSSES = {'policy': policy_loss, 'no bonus': functools.partial(policy_loss, bonus=0.0), 'reward': reward_loss}
+LOSSES = {'policy': policy_loss, 'no bonus': functools.partial(policy_loss, bonus=0.0),
+          'some actions': functools.partial(policy_loss, masked=True), 'reward': reward_loss}
 
 
 def results(network, batch, loss):
@@ -469,7 +473,7 @@ def test_logits_that_are_all_but_certain_have_finite_gradients():
         network.parts[0].weight.copy_(torch.eye(4))
         network.parts[0].bias.zero_()
     inputs = 1e4 * randoms(3, 5, 1, 4)
-    loss = losses.PolicyLoss(inputs.argmax(-1), torch.zeros(3, 5, 1), randoms(3, 5, 1), torch.ones(3, 5), 0.2, 0.3)
+    loss = losses.PolicyLoss(inputs.argmax(-1), torch.zeros(3, 5, 1), randoms(3, 5, 1), torch.ones(3, 5, 1), 0.2, 0.3)
     gradient, sums = network.gradient(loss, inputs, torch.empty(5, 1, 0), torch.zeros(3, 5, dtype=torch.bool))
     assert gradient.isfinite().all() and sums.isfinite().all()
     assert sums[1] == pytest.approx(0, abs=1e-5)  # no entropy

@@ -31,7 +31,7 @@ PLAIN_REWARD = replace(REWARD, epochs=1, learning_rate=1.0)
 def random_trajectory(steps=7, worlds=3, spec=SPEC, seed=0, terminations=0.15, truncations=0.15):
     """A rollout of noise, with episodes that end for good and others that are cut off in its middle."""
     random = np.random.default_rng(seed)
-    T, W, (N, A, O, S, _) = steps, worlds, spec
+    T, W, (N, A, O, S, *_) = steps, worlds, spec
     terminated = random.random((T, W)) < terminations
     truncated = ~terminated & (random.random((T, W)) < truncations)
     probabilities = random.dirichlet(np.ones(A), (T, W, N)).astype(np.float32)
@@ -361,7 +361,7 @@ def test_the_state_of_another_network_is_not_taken_over(make_learner):
 
 def test_an_update_leaves_the_rollout_and_earlier_policies_as_they_were(make_learner):
     learner, trajectory = make_learner(), random_trajectory()
-    copies = [part.copy() for part in trajectory]
+    copies = trajectory.map(np.copy)
     policy = learner.policy
     encoded = encode_policy(policy)
     learner.update(trajectory, 0)

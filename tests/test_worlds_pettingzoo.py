@@ -50,9 +50,9 @@ class TinyTeam(ParallelEnv):
                  for name, steps in self.ends.items()}
         rewards = {'left': 1.0, 'right': 2.0}
         observations = self._observe()
-        if any(any(ends.values()) for ends in ended.values()):
-            self.agents = []
-        return observations, rewards, ended['terminations'], ended['truncations'], {}
+        here, self.agents = self.agents, [agent for agent in self.agents if not any(ends[agent] for ends in ended.values())]
+        told = [{agent: numbers[agent] for agent in here} for numbers in (observations, rewards, *ended.values())]
+        return *told, {}
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def no_actions(worlds):
 
 def test_an_environment_of_mpe2_runs_as_it_does_by_itself():
     worlds = spread(num_agents=4, episode_steps=5)
-    assert worlds.spec == (4, 5, 24, 96, False)
+    assert worlds.spec == (4, 5, 24, 96, False, False)
     environment = simple_spread_v3.parallel_env(N=4, max_cycles=5)
     joint = worlds.reset(seed=7, rollout=2)
     seen, _ = environment.reset(seed=draws.key(7, 'reset', 2, 0, 1) % 2**31)
@@ -123,7 +123,7 @@ def test_an_environment_of_butterfly_with_images_plugs_in():
 
 def test_short_observations_are_padded_and_make_the_state_where_there_is_none(tiny):
     worlds = tiny()
-    assert worlds.spec == (2, 3, 3, 6, True)
+    assert worlds.spec == (2, 3, 3, 6, True, False)
     joint = worlds.reset(seed=1, rollout=0)
     assert joint.observations[:, 0, :2].all() and joint.observations[:, 1].all()
     assert not joint.observations[:, 0, 2].any()
@@ -189,7 +189,7 @@ def test_global_generators_neither_disturb_the_worlds_nor_are_disturbed(tiny):
     ({'actions': (spaces.Box(-1, 1), spaces.Box(-1, 1))}, WorldError, 'actions that are not discrete'),
     ({'actions': (spaces.Discrete(3), spaces.Discrete(4))}, WorldError, r'different numbers of actions \(\[3, 4\]\)'),
     ({'observation_space': lambda self, agent: spaces.Dict({'action_mask': spaces.MultiBinary(3)})},
-     WorldError, 'masks actions'),
+     WorldError, 'shows its agents nothing'),
     ({'observation_space': lambda self, agent: spaces.Sequence(spaces.Discrete(2))}, WorldError, 'cannot be flattened'),
 ])
 def test_an_environment_that_does_not_fit_is_refused_in_one_sentence(tiny, attributes, error, complaint):
@@ -198,21 +198,65 @@ def test_an_environment_that_does_not_fit_is_refused_in_one_sentence(tiny, attri
     assert '\n' not in str(caught.value)
 
 
-def test_masks_told_in_the_infos_are_refused(tiny):
-    def reset(self, seed=None, options=None):
-        observations, infos = TinyTeam.reset(self, seed, options)
-        return observations, {agent: {'action_mask': [1, 1, 0]} for agent in infos}
-
-    with pytest.raises(WorldError, match='masks actions'):
-        tiny(reset=reset).reset(1, 0)
+MASK = np.array([0, 1, 1], np.int8)
 
 
-def test_members_that_leave_before_the_others_are_named(tiny):
-    worlds = tiny(ends={'terminations': (9, 2), 'truncations': (9, 9)})
+def masked_space(self, agent):
+    return spaces.Dict({'action_mask': spaces.MultiBinary(3), 'observation': spaces.Box(-1.0, 1.0, (2,))})
+
+
+def masked_observation(self):
+    return {agent: {'action_mask': MASK, 'observation': np.full(2, 0.25, np.float32)} for agent in self.possible_agents}
+
+
+def infos_with_masks(self, seed=None, options=None):
+    observations, infos = TinyTeam.reset(self, seed, options)
+    return observations, {agent: {'action_mask': MASK} for agent in infos}
+
+
+@pytest.mark.parametrize('attributes', [{'observation_space': masked_space, '_observe': masked_observation},
+                                        {'reset': infos_with_masks}], ids=['observed', 'told'])
+def test_masks_of_actions_are_passed_on_and_are_no_observation(tiny, attributes):
+    worlds = tiny(**attributes)
+    shown = worlds.reset(1, 0)
+    assert (shown.available == MASK.astype(bool)).all() and shown.available.shape == (2, 2, 3)
+    assert shown.present is None
+    if 'observation_space' in attributes:
+        assert worlds.spec.observation_size == 2 and (shown.observations == 0.25).all()
+        assert (worlds.step(no_actions(worlds) + 1).next.available == MASK.astype(bool)).all()
+
+
+def test_a_mask_that_leaves_an_agent_nothing_to_do_is_an_error(tiny, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], 'MASK', np.zeros(3, np.int8))
+    with pytest.raises(WorldError, match='left of pettingzoo:tiny_team has no action it may choose'):
+        tiny(reset=infos_with_masks).reset(1, 0)
+
+
+def test_members_that_leave_before_the_others_are_absent_until_the_last_one_ends(tiny):
+    worlds = tiny(num_worlds=1, ends={'terminations': (4, 2), 'truncations': (9, 9)})
+    assert worlds.reset(1, 0).present is None
+    for step in range(1, 9):
+        transition = worlds.step(no_actions(worlds) + 1)
+        if step % 4 in (2, 3):
+            assert transition.next.present.tolist() == [[True, False]]
+            assert transition.next.available.tolist() == [[[True, True, True], [True, False, False]]]
+            assert transition.next.observations[0, 0].any() and not transition.next.observations[0, 1].any()
+        else:
+            assert transition.next.present is None and transition.next.available is None
+        assert transition.terminated.all() == (step % 4 == 0) and not transition.truncated.any()
+        assert transition.reward.tolist() == [0.5 if step % 4 in (3, 0) else 1.5]
+    taken = worlds._environments[0].taken
+    assert [sorted(actions) for actions in taken] == 2 * [['left', 'right'], ['left', 'right'], ['left'], ['left']]
+
+
+def test_an_end_of_the_last_agents_that_terminates_not_all_of_them_is_cut_off(tiny):
+    worlds = tiny(num_worlds=1, ends={'terminations': (9, 2), 'truncations': (3, 9)})
     worlds.reset(1, 0)
-    worlds.step(no_actions(worlds))
-    with pytest.raises(WorldError, match='right left pettingzoo:tiny_team before the others; members leaving is not'):
-        worlds.step(no_actions(worlds))
+    for _ in range(3):
+        transition = worlds.step(no_actions(worlds))
+    assert transition.truncated.all() and transition.final_states.shape == (1, 6)
+    assert transition.final_states[0, :3].any() and not transition.final_states[0, 3:].any()
+    assert transition.next.present is None and transition.next.episode_start.all()
 
 
 @pytest.mark.parametrize('name, complaint', [

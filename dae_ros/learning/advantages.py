@@ -62,9 +62,22 @@ def n_step_returns(rewards: Tensor, values: Tensor, continues: Tensor, cut_off: 
     return returns
 
 
-def normalized(advantages: Tensor) -> Tensor:
-    """Mean 0 and deviation 1 over everything."""
-    return (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-5)
+def normalized(advantages: Tensor, present: Tensor | None) -> Tensor:
+    """Mean 0 and deviation 1 over everything, or over those `present`, bool of the same shape."""
+    counted = among(advantages, present)
+    return (advantages - counted.mean()) / (counted.std(correction=0) + 1e-5)
+
+
+def among(numbers: Tensor, present: Tensor | None) -> Tensor:
+    """Those of numbers [T, W, N] that belong to agents `present` [T, W, N] bool; all if that is None."""
+    return numbers if present is None else numbers[present]
+
+
+def mean_over_agents(numbers: Tensor, present: Tensor | None) -> Tensor:
+    """[T, W] from numbers [T, W, N], over the agents `present` [T, W, N] bool; 0 where there are none."""
+    if present is None:
+        return numbers.mean(-1)
+    return torch.where(present, numbers, 0).sum(-1) / present.sum(-1).clamp_min(1)
 
 
 def _discounted_sum(terms: Tensor, factors: Tensor) -> Tensor:

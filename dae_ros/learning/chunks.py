@@ -13,6 +13,8 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from dae_ros.types import Trajectory
+
 MOST_ROWS = 496   # of a recurrent step in a shard: memory grows with them
 FEWEST_ROWS = 48  # in a shard: starting one costs as much as ten rows
 
@@ -25,7 +27,8 @@ class PolicyChunks(NamedTuple):
     actions: Tensor            # [L, C, N] int64
     log_probabilities: Tensor  # [L, C, N] of the actions taken, under the acting policy
     advantages: Tensor         # [L, C, N] normalised
-    weights: Tensor            # [L, C] 1, and 0 for filling
+    weights: Tensor            # [L, C, N] 1, and 0 for agents that have left, and for filling
+    available: Tensor | None   # [L, C, N, A] bool actions that may be chosen; None: all
 
 
 class ValueChunks(NamedTuple):
@@ -45,7 +48,7 @@ class ActionChunks(NamedTuple):
     episode_start: Tensor  # [L, C] bool
     actions: Tensor        # [L, C, N] int64
     targets: Tensor        # [L, C] what it should have said of the actions taken
-    weights: Tensor        # [L, C]
+    weights: Tensor        # [L, C, N]
 
 
 Chunks = TypeVar('Chunks', PolicyChunks, ValueChunks, ActionChunks)
@@ -53,7 +56,7 @@ Chunks = TypeVar('Chunks', PolicyChunks, ValueChunks, ActionChunks)
 
 def chosen_chunks(chunks: Chunks, chosen: Tensor | slice) -> Chunks:
     """Some of the chunks."""
-    return chunks._make(part[:, chosen] for part in chunks)
+    return chunks._make(None if part is None else part[:, chosen] for part in chunks)
 
 
 def to_chunks(sequences: Tensor, length: int) -> Tensor:
@@ -64,6 +67,12 @@ def to_chunks(sequences: Tensor, length: int) -> Tensor:
     if missing:
         flat = torch.cat([flat, flat.new_zeros(missing, *flat.shape[1:])])
     return flat.view(-1, length, *flat.shape[1:]).transpose(0, 1)
+
+
+def agent_weights(data: Trajectory) -> Tensor:
+    """[T, W, N] what each agent's steps count in the losses: 1, and 0 once it has left."""
+    present = torch.ones_like(data.actions) if data.present is None else data.present
+    return present.to(data.rewards.dtype)
 
 
 def first_states(states: Tensor, length: int) -> Tensor:

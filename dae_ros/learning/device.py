@@ -43,7 +43,7 @@ def _seconds(spec: WorldSpec, settings: Settings, trajectory: Trajectory, device
 def random_trajectory(spec: WorldSpec, num_worlds: int, num_steps: int) -> Trajectory:
     """A rollout of one episode in the sizes of the run."""
     random = np.random.default_rng(0)
-    T, W, (N, A, O, S, _) = num_steps, num_worlds, spec
+    T, W, (N, A, O, S, *_) = num_steps, num_worlds, spec
     episode_start, terminated = np.zeros((T + 1, W), bool), np.zeros((T, W), bool)
     episode_start[[0, -1]] = terminated[-1] = True
     return Trajectory(random.standard_normal((T, W, N, O), np.float32), random.standard_normal((T + 1, W, S), np.float32),

@@ -66,7 +66,8 @@ class LeadingLearner(Learner):
                    'spec': np.array(spec, np.int64)})
 
     def update(self, trajectory: Trajectory, rollout: int) -> dict[str, float]:
-        parts = {f'trajectory.{name}': np.ascontiguousarray(part) for name, part in trajectory._asdict().items()}
+        parts = {f'trajectory.{name}': np.ascontiguousarray(part) for name, part in trajectory._asdict().items()
+                 if part is not None}
         self._team.send({'rollout': np.array(rollout)} | parts | {f'state.{n}': part for n, part in self.state().items()})
         return super().update(trajectory, rollout)
 
@@ -90,8 +91,8 @@ def help_to_learn() -> None:
     try:
         first = team.receive()
         settings = config.from_flat(json.loads(first['settings'].tobytes()))
-        *sizes, state_is_observations = first['spec'].tolist()
-        spec = WorldSpec(*sizes, bool(state_is_observations))
+        *sizes, state_is_observations, has_wins = first['spec'].tolist()
+        spec = WorldSpec(*sizes, bool(state_is_observations), bool(has_wins))
         learner = Learner(spec, settings.learner, settings.reward_network, settings.run.seed, team,
                           chosen_device(spec, settings))
         while arrays := team.receive():

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.learning import advantages, losses
-from dae_ros.learning.chunks import ActionChunks, ValueChunks, first_states, to_chunks
+from dae_ros.learning.chunks import ActionChunks, ValueChunks, agent_weights, first_states, to_chunks
 from dae_ros.learning.networks import RewardNetwork, Table, make_action_value_network, make_critic, make_reward_network
 from dae_ros.learning.optimizer import FlatAdam
 from dae_ros.learning.parallel import Training
@@ -57,7 +57,7 @@ class ActionNetwork:
         network = self.adam.network
 
         def gradient(shard: ActionChunks, initial: Tensor, shared: Table | None = None) -> tuple[Tensor, Tensor]:
-            loss = losses.RewardLoss(shard.actions, shard.targets, shard.weights / network.num_agents)
+            loss = losses.RewardLoss(shard.actions, shard.targets, shard.weights)
             return network.gradient(loss, shard.inputs, initial, shard.episode_start, shard.actions, shared)
 
         @torch.no_grad()
@@ -109,13 +109,13 @@ class DifferenceEstimator:
                                                  settings.gae_lambda)
         expected = None
         if self._exact_rewards is not None:
-            expected = torch.from_numpy(self._exact_rewards(Trajectory(*(part.cpu().numpy() for part in data)))).to(team)
+            expected = torch.from_numpy(self._exact_rewards(data.map(lambda part: part.cpu().numpy()))).to(team)
         elif self._reward:
             remembered = as_remembered(data, self._reward_settings)
             predicted, inputs, states = ensemble_prediction(self._reward, remembered)
-            expected = advantages.expected_rewards(predicted, data.probabilities)
+            expected = self._expected(predicted, data)
             taken = advantages.of_actions(predicted, data.actions)
-            error = (taken - data.rewards.unsqueeze(-1)).square().mean()
+            error = advantages.among((taken - data.rewards.unsqueeze(-1)).square(), data.present).mean()
             metrics['reward_network/explained_variance'] = float(
                 1 - error / data.rewards.var(correction=0).clamp_min(1e-12))
             if not self._reward_settings.freeze:
@@ -126,7 +126,8 @@ class DifferenceEstimator:
                                                                 settings.gae_lambda)
 
         # Line 20: value targets; the critic sees one state per world, so it regresses on the agents' mean.
-        targets = values[:-1] + (estimated.mean(-1) if settings.value_target == 'difference' else team)
+        credited = advantages.mean_over_agents(estimated, data.present)
+        targets = values[:-1] + (credited if settings.value_target == 'difference' else team)
         self._value_norm.update(targets)
         cut = partial(to_chunks, length=chunk_length(data, settings))
         chunks = ValueChunks(cut(data.states[:-1].unsqueeze(2)), cut(data.episode_start[:-1]), cut(normalized_values[:-1]),
@@ -139,7 +140,7 @@ class DifferenceEstimator:
         if not self._reward:
             raise ValueError('at beta = 0 there is no reward network')
         predicted, _, _ = ensemble_prediction(self._reward, as_remembered(data, self._reward_settings))
-        return advantages.expected_rewards(predicted, data.probabilities)
+        return self._expected(predicted, data)
 
     def begin_with(self, reward_networks: list[dict[str, Tensor]]) -> None:
         """Takes over the parameters of reward networks that were trained before, one for each member."""
@@ -157,6 +158,12 @@ class DifferenceEstimator:
         self._value_norm.load_state(tensors['value_norm'])
         if self._replay:
             self._replay.load_state(tensors)
+
+    def _expected(self, predicted: Tensor, data: Trajectory) -> Tensor:
+        """E over a_i ~ pi_i of what was predicted, [T, W, N]. Of an agent that has left, which had no choice, all that came
+        was to be expected."""
+        expected = advantages.expected_rewards(predicted, data.probabilities)
+        return expected if data.present is None else torch.where(data.present, expected, data.rewards.unsqueeze(-1))
 
     def _values(self, data: Trajectory):
         """Normalised values [T + 1, W], the critic's recurrent states [T + 1, W, 1, H], values [K] of the final states."""
@@ -223,12 +230,14 @@ class CounterfactualEstimator:
         normalized, states = network.predict(inputs, data)
         values = self._value_norm.denormalize(normalized)
         taken = advantages.of_actions(values, data.actions)
+        of_team = advantages.mean_over_agents(taken, data.present)
+        if data.present is not None:  # of agents that have left it is not learnt
+            taken = torch.where(data.present, taken, of_team.unsqueeze(-1))
         later = advantages.n_step_returns(data.rewards, taken, continues, cut_off, settings.gamma, self._num_rewards)
         estimated = later - advantages.expected_rewards(values, data.probabilities)
 
-        targets = advantages.lambda_returns(data.rewards, taken.mean(-1), continues, cut_off, settings.gamma,
-                                            settings.gae_lambda)
-        explained = 1 - (taken.mean(-1) - targets).square().mean() / targets.var(correction=0).clamp_min(1e-12)
+        targets = advantages.lambda_returns(data.rewards, of_team, continues, cut_off, settings.gamma, settings.gae_lambda)
+        explained = 1 - (of_team - targets).square().mean() / targets.var(correction=0).clamp_min(1e-12)
         self._value_norm.update(targets)
         chunks = action_chunks(data, inputs, self._value_norm.normalize(targets), settings)
         batches = self._passes.epochs(network.name, chunks, first_states(states, len(chunks.weights)), self._epochs,
@@ -264,4 +273,4 @@ def action_chunks(data: Trajectory, inputs: Tensor, targets: Tensor, settings: L
     """A rollout cut up for an `ActionNetwork`."""
     cut = partial(to_chunks, length=chunk_length(data, settings))
     return ActionChunks(cut(inputs), cut(data.episode_start[:-1]), cut(data.actions), cut(targets),
-                        cut(torch.ones_like(targets)))
+                        cut(agent_weights(data)))

@@ -47,7 +47,8 @@ class LossTerms(NamedTuple):
     numbers: tuple[float, ...]  # at most 3
     actions: Tensor | None      # [L, C, N] int64
     data: tuple[Tensor, ...]    # at most 2
-    weights: Tensor             # [L, C]
+    weights: Tensor             # [L, C, N]; of a value loss [L, C]
+    available: Tensor | None = None  # [L, C, N, A] bool actions a policy may choose; None: all
 
 
 def available() -> bool:
@@ -95,8 +96,9 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
     numbers = loss.numbers + (0.0,) * (3 - len(loss.numbers))
     shape = agents if loss.kind == 'policy' else columns
     data = [_array(x, shape, torch.float32, kept) for x in (*loss.data, None)[:2]]
+    weights = _array(loss.weights, columns if loss.kind == 'value' else agents, torch.float32, kept)
     terms = CLoss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _array(loss.actions, agents, torch.int64, kept),
-                  (CArray * 2)(*data), _array(loss.weights, columns, torch.float32, kept))
+                  (CArray * 2)(*data), weights, _array(loss.available, (*agents, outputs), torch.bool, kept))
     _check(library.network_gradient(_steps(steps, gradients), len(steps), _batch(steps, batch, kept), terms,
                                     None if batch.table is None else address, sums.data_ptr()))
     return flat, sums.float()

@@ -16,7 +16,7 @@ from torch import Tensor
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.errors import SettingsError
 from dae_ros.learning import advantages, losses
-from dae_ros.learning.chunks import PolicyChunks, first_states, to_chunks
+from dae_ros.learning.chunks import PolicyChunks, agent_weights, first_states, to_chunks
 from dae_ros.learning.estimators import ESTIMATORS, DifferenceEstimator, ExpectedRewards, chunk_length
 from dae_ros.learning.networks import make_actor
 from dae_ros.learning.optimizer import FlatAdam
@@ -56,13 +56,14 @@ class Learner:
         _, actor_states = self._passes.forward(self._actor.network, self._spec.num_agents, data.observations,
                                                data.episode_start[:-1])
         estimated, trainings, metrics = self._estimator.estimate(data, rollout)
-        metrics['advantage/deviation'] = float(estimated.std(correction=0))
+        metrics['advantage/deviation'] = float(advantages.among(estimated, data.present).std(correction=0))
 
         # Lines 21 to 24: chunks, with the recurrent states they begin with.
         cut = partial(to_chunks, length=chunk_length(data, self._settings))
         chunks = PolicyChunks(cut(data.observations), cut(data.episode_start[:-1]), cut(data.actions),
                               cut(advantages.of_actions(data.probabilities, data.actions).log()),
-                              cut(advantages.normalized(estimated)), cut(torch.ones_like(data.rewards)))
+                              cut(advantages.normalized(estimated, data.present)), cut(agent_weights(data)),
+                              None if data.available is None else ~cut(~data.available))  # where it is filling, all are
         first = first_states(actor_states, len(chunks.weights))
 
         # Lines 26 to 32: epochs.
@@ -110,14 +111,14 @@ class Learner:
         return {'actor': self._actor} | self._estimator.networks()
 
     def _tensors(self, trajectory: Trajectory) -> Trajectory:
-        return Trajectory(*(torch.from_numpy(np.ascontiguousarray(part)).to(self._passes.device) for part in trajectory))
+        return trajectory.map(lambda part: torch.from_numpy(np.ascontiguousarray(part)).to(self._passes.device))
 
     def _actor_training(self, chunks: PolicyChunks, first: Tensor, rollout: int) -> Training:
         settings, network, N = self._settings, self._actor.network, self._spec.num_agents
 
         def gradient(shard: PolicyChunks, initial: Tensor) -> tuple[Tensor, Tensor]:
-            loss = losses.PolicyLoss(shard.actions, shard.log_probabilities, shard.advantages, shard.weights / N, settings.clip,
-                                     settings.entropy_coefficient)
+            loss = losses.PolicyLoss(shard.actions, shard.log_probabilities, shard.advantages, shard.weights, settings.clip,
+                                     settings.entropy_coefficient, shard.available)
             return network.gradient(loss, shard.observations, initial, shard.episode_start)
 
         batches = self._passes.epochs('actor', chunks, first, settings.epochs, settings.num_mini_batches, rollout)

@@ -14,6 +14,8 @@ from torch.nn import functional
 
 from dae_ros.learning.kernels import LossTerms
 
+_UNAVAILABLE = -1e10  # a logit whose probability is exactly 0, and that times its logarithm, too
+
 
 class PolicyLoss(NamedTuple):
     """The clipped surrogate (eq. 4), negated, less the entropy bonus; on logits [L, C, N, A]."""
@@ -21,13 +23,16 @@ class PolicyLoss(NamedTuple):
     actions: Tensor                # [L, C, N] int64
     old_log_probabilities: Tensor  # [L, C, N] of the actions under the acting policy
     advantages: Tensor             # [L, C, N]
-    weights: Tensor                # [L, C] of each agent of a column
+    weights: Tensor                # [L, C, N]
     clip: float
     entropy_coefficient: float
+    available: Tensor | None = None  # [L, C, N, A] bool actions that may be chosen; None: all
 
     sums = ('policy/loss', 'policy/entropy', 'policy/clipped_fraction', 'policy/kl')
 
     def __call__(self, logits: Tensor) -> tuple[Tensor, Tensor]:
+        if self.available is not None:
+            logits = logits.masked_fill(~self.available, _UNAVAILABLE)
         log_probabilities = torch.log_softmax(logits, -1)
         log_ratio = log_probabilities.gather(-1, self.actions.unsqueeze(-1)).squeeze(-1) - self.old_log_probabilities
         ratio = log_ratio.exp()
@@ -35,13 +40,13 @@ class PolicyLoss(NamedTuple):
         entropy = -(log_probabilities.exp() * log_probabilities).sum(-1)
         clipped = ((ratio - 1).abs() > self.clip).to(ratio.dtype)
         parts = torch.stack([-surrogate, entropy, clipped, -log_ratio])
-        sums = (parts * self.weights.unsqueeze(-1)).sum((1, 2, 3))
+        sums = (parts * self.weights).sum((1, 2, 3))
         return sums[0] - self.entropy_coefficient * sums[1], sums.detach()
 
     @property
     def terms(self) -> LossTerms:
         return LossTerms('policy', (self.clip, self.entropy_coefficient), self.actions,
-                         (self.old_log_probabilities, self.advantages), self.weights)
+                         (self.old_log_probabilities, self.advantages), self.weights, self.available)
 
 
 class ValueLoss(NamedTuple):
@@ -76,13 +81,13 @@ class RewardLoss(NamedTuple):
 
     actions: Tensor  # [L, C, N] int64
     rewards: Tensor  # [L, C]
-    weights: Tensor  # [L, C] of each agent of a column
+    weights: Tensor  # [L, C, N]
 
     sums = ('reward_network/loss',)
 
     def __call__(self, predicted: Tensor) -> tuple[Tensor, Tensor]:
         taken = predicted.gather(-1, self.actions.unsqueeze(-1)).squeeze(-1)
-        loss = ((taken - self.rewards.unsqueeze(-1)).square() * self.weights.unsqueeze(-1)).sum() / 2
+        loss = ((taken - self.rewards.unsqueeze(-1)).square() * self.weights).sum() / 2
         return loss, loss.detach().view(1)
 
     @property

@@ -67,10 +67,12 @@ class Policy:
         """Recurrent state before an episode: zeros [W, H]."""
         return np.zeros((num_worlds, self.architecture.hidden_size), np.float32)
 
-    def act(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def act(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray,
+            available: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Action probabilities and the next recurrent state.
 
         values: observations [W, O] float32. state: [W, H] float32. episode_start: [W] bool; the state is forgotten there.
+        available: [W, A] bool, at least one of each row; all others have probability 0. None: all are.
         Returns ([W, A] float32 with rows that sum to 1, [W, H] float32). ValueError if an argument is of another shape or
         type.
         """
@@ -80,7 +82,12 @@ class Policy:
         needed = (W, self.architecture.observation_size), _FLOAT, (W, self.architecture.hidden_size), _FLOAT, (W,), _BOOL
         if given != needed:
             raise ValueError(f'observations, state and episode starts are {given} where {needed} is needed')
-        return self._network(values, state, episode_start)
+        if available is not None:
+            available = np.ascontiguousarray(available)
+            if (available.shape, available.dtype) != ((W, self.architecture.num_actions), _BOOL):
+                raise ValueError(f'available actions are {available.dtype} {available.shape} where bool '
+                                 f'{(W, self.architecture.num_actions)} is needed')
+        return self._network(values, state, episode_start, available)
 
 
 class _Compiled:
@@ -111,11 +118,12 @@ class _Compiled:
         self._network = ctypes.addressof(steps), len(row), packed.ctypes.data
         self._act, self._sizes = compiled.policy_act, (A, H)
 
-    def __call__(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray,
+                 available: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         W, (A, H) = len(values), self._sizes
         probabilities, next_state = np.empty((W, A), np.float32), np.empty((W, H), np.float32)
         if self._act(*self._network, W, values.ctypes.data, state.ctypes.data, episode_start.ctypes.data,
-                     probabilities.ctypes.data, next_state.ctypes.data):
+                     None if available is None else available.ctypes.data, probabilities.ctypes.data, next_state.ctypes.data):
             raise MemoryError(f'no memory to act in {W} worlds')
         return probabilities, next_state
 
@@ -148,7 +156,8 @@ class _InNumpy:
         self._averages = [np.full(size, 1 / size, np.float32) for size in (architecture.observation_size, H)]
         self._head = np.ascontiguousarray(after('gru_norm', exact['head.weight'], exact['head.bias']).T, np.float32)
 
-    def __call__(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, values: np.ndarray, state: np.ndarray, episode_start: np.ndarray,
+                 available: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         H, x, (average, hidden_average) = self._architecture.hidden_size, values, self._averages
         for layer in self._layers:
             x = _standardised(x, average) @ layer
@@ -172,6 +181,8 @@ class _InNumpy:
         state *= update
         state += candidate
         scores = self._head @ _standardised(state, average).T  # [A, W]: sums over actions along the worlds are the quicker ones
+        if available is not None:
+            scores[~available.T] = -np.inf
         scores -= scores.max(axis=0)
         np.exp(scores, out=scores)
         scores /= scores.sum(axis=0)

@@ -50,9 +50,9 @@ class _Layout:
         return self._numbers.unpack_from(body), arrays
 
 
-_JOINT_STATE = _Layout('QIIIIIII', _B, _F, _F)
+_JOINT_STATE = _Layout('QIIIIIIII', _B, _F, _F, _B, _B)
 _ACTION = _Layout('QIIIIQII', _H, _F)
-_SHARED_REWARD = _Layout('QIIIII', _F, _B, _B, _F)
+_SHARED_REWARD = _Layout('QIIIII', _F, _B, _B, _F, _B)
 _ROLLOUT_REQUEST = _Layout('QIIQQI?')
 
 
@@ -65,10 +65,15 @@ def _shaped(values: np.ndarray, *shape: int) -> np.ndarray:
     return values.reshape(shape)
 
 
+def _optional_flags(values: np.ndarray, *shape: int) -> np.ndarray | None:
+    return _shaped(values, *shape) != 0 if len(values) else None
+
+
 def joint_state(data: Data) -> JointState:
-    (*stamp, W, N, O, S), (episode_start, observations, state) = _JOINT_STATE.read(data)
+    (*stamp, W, N, O, S, A), (episode_start, observations, state, available, present) = _JOINT_STATE.read(data)
     return JointState(Stamp(*stamp), _shaped(episode_start, W) != 0, _shaped(observations, W, N, O),
-                      _shaped(state if len(state) else observations, W, S))
+                      _shaped(state if len(state) else observations, W, S), _optional_flags(available, W, N, A),
+                      _optional_flags(present, W, N))
 
 
 def action(data: Data) -> Action:
@@ -77,10 +82,10 @@ def action(data: Data) -> Action:
 
 
 def shared_reward(data: Data) -> SharedReward:
-    (*stamp, W, S), (reward, terminated, truncated, final_states) = _SHARED_REWARD.read(data)
+    (*stamp, W, S), (reward, terminated, truncated, final_states, won) = _SHARED_REWARD.read(data)
     truncated = _shaped(truncated, W) != 0
     return SharedReward(Stamp(*stamp), _shaped(reward, W), _shaped(terminated, W) != 0, truncated,
-                        _shaped(final_states, int(truncated.sum()), S))
+                        _shaped(final_states, int(truncated.sum()), S), _optional_flags(won, W))
 
 
 def rollout_request(data: Data) -> RolloutRequest:
@@ -99,11 +104,11 @@ class MessageType(NamedTuple):
 
 MESSAGE_TYPES = {
     'dae_ros_msgs/msg/JointState': MessageType(
-        'RIHS01_f2294d0f7eb3d5932d9ecb0d4953d5ae5e5ab67a5f12701f9d541dfa0452e1ea', joint_state),
+        'RIHS01_9be7572b564d14a11148a3cb68770b8547fc61d28cf0199c934ac00aa101ecd0', joint_state),
     'dae_ros_msgs/msg/Action': MessageType(
         'RIHS01_5f0753427771899ac703152b8fe4f4a9340f8bdbcd9a678c9af3da1f444decd9', action),
     'dae_ros_msgs/msg/SharedReward': MessageType(
-        'RIHS01_44faa7a2e349d8bdf9dc7bfc5c8adf79b8540aac28ecec0c9bff57ed9c470893', shared_reward),
+        'RIHS01_03b9f6721c8344cbe63df4fa7de23e507c9ed8abf0335a70fea4ac397a7c7fbe', shared_reward),
     'dae_ros_msgs/msg/RolloutRequest': MessageType(
         'RIHS01_2d08795b1f2c544c880fd05540fbb505915d8c3ea53ff43efdf4e4655f28f52e', rollout_request),
 }

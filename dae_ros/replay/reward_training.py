@@ -18,7 +18,7 @@ from dae_ros import draws
 from dae_ros.config import RewardTrainingSettings, Settings
 from dae_ros.errors import BagError
 from dae_ros.learning import advantages, reward_files
-from dae_ros.learning.chunks import ActionChunks, chosen_chunks, first_states, to_chunks
+from dae_ros.learning.chunks import ActionChunks, agent_weights, chosen_chunks, first_states, to_chunks
 from dae_ros.learning.device import chosen_device
 from dae_ros.learning.estimators import ActionNetwork, action_chunks, as_remembered, chunk_length, ensemble_prediction
 from dae_ros.learning.networks import make_reward_network
@@ -192,8 +192,8 @@ class RewardTraining:
             data = as_remembered(data, self._reward)
             inputs = self._members[0].inputs(data)
             chunks = action_chunks(data, inputs, data.rewards, self._learner)
-            chunks = chunks._replace(weights=chunks.weights * to_chunks(learnt.float(), length))
-            useful = (chunks.weights.sum(0) > 0).nonzero().flatten()
+            chunks = chunks._replace(weights=chunks.weights * to_chunks(learnt.float(), length).unsqueeze(-1))
+            useful = (chunks.weights.sum((0, 2)) > 0).nonzero().flatten()
             firsts = [first_states(member.predict(inputs, data)[1], len(chunks.weights))[useful] for member in self._members]
             pool.append((chosen_chunks(chunks, useful), firsts))
             size += len(useful)
@@ -208,7 +208,7 @@ class RewardTraining:
             if not held.numel():
                 continue
             taken = advantages.of_actions(self._predict(data), data.actions)
-            error = (taken - data.rewards.unsqueeze(-1))[held]
+            error = (taken - data.rewards.unsqueeze(-1))[held.unsqueeze(-1) & (agent_weights(data) > 0)]
             total += float(error.double().square().sum())
             count += error.numel()
         return total / count
@@ -220,9 +220,12 @@ class RewardTraining:
     def _of_worlds(self, trajectory: Trajectory, wanted: np.ndarray) -> tuple[Trajectory, Tensor]:
         """The rollout in the worlds in which any step is wanted, and `wanted` [T, W] there, as tensors."""
         worlds = wanted.any(axis=0)
-        parts = [part[:, worlds] for part in (*trajectory[:-1], wanted)]
-        *parts, wanted = (torch.from_numpy(np.ascontiguousarray(part)).to(self._passes.device) for part in parts)
-        return Trajectory(*parts, torch.from_numpy(trajectory.final_states)), wanted
+
+        def of_worlds(part: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(part[:, worlds])).to(self._passes.device)
+
+        final_states = torch.from_numpy(trajectory.final_states)
+        return trajectory._replace(final_states=None).map(of_worlds)._replace(final_states=final_states), of_worlds(wanted)
 
     def _weights(self) -> list[dict[str, Tensor]]:
         return [{name: tensor.clone() for name, tensor in member.adam.state().items()} for member in self._members]

@@ -15,7 +15,7 @@ from PIL import Image
 from dae_ros.config import TaskSettings
 from dae_ros.learning.policy import Policy, choose
 from dae_ros.report.style import FAINT, GREY, INK, ROBOTS, plain, signed
-from dae_ros.worlds import PREFIX, make_worlds, side_by_side
+from dae_ros.worlds import make_worlds, side_by_side
 from dae_ros.worlds.particle import ParticleWorlds
 
 EPISODES = 3            # side by side
@@ -59,8 +59,9 @@ def _record(task: str, worlds, policy: Policy, seed: int) -> Episodes:
             targets.append(worlds.targets.copy())
         joint = np.empty((worlds.num_worlds, len(robots)), np.int64)
         for robot in robots:
+            available = None if seen.available is None else seen.available[:, robot]
             probabilities, states[robot] = policy.act(np.ascontiguousarray(seen.observations[:, robot]), states[robot],
-                                                      seen.episode_start)
+                                                      seen.episode_start, available)
             joint[:, robot] = choose(probabilities, True, seed, ROLLOUT, len(rewards), robot)
         transition = worlds.step(joint)
         seen = transition.next
@@ -147,7 +148,7 @@ def _draw_actions(episodes: Episodes, path: Path) -> None:
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1.0])
     image = top.imshow(episodes.actions[:length, 0].T, aspect='auto', cmap='cividis', interpolation='nearest')
     top.set_ylabel('robot', fontsize=9, color=INK)
-    top.set_title(f'{episodes.task.removeprefix(PREFIX)}: actions of one episode, '
+    top.set_title(f'{episodes.task.partition(":")[2] or episodes.task}: actions of one episode, '
                   f'return {signed(episodes.rewards[:length, 0].sum())}', loc='left', fontsize=10, color=INK)
     figure.colorbar(image, ax=top, label='action', pad=0.01)
     plain(below)

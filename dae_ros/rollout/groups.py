@@ -42,8 +42,13 @@ def join(trajectories: Sequence[Trajectory]) -> Trajectory:
     """The groups' trajectories of one rollout as one, their worlds in the order of the groups."""
     if len(trajectories) == 1:
         return trajectories[0]
-    *by_world, final_states = zip(*trajectories)
     # Final states go by step and then by world: within a step, a stable sort keeps the order of the groups.
     steps = np.concatenate([np.nonzero(trajectory.truncated)[0] for trajectory in trajectories])
-    return Trajectory(*(np.concatenate(parts, axis=1) for parts in by_world),
-                      np.concatenate(final_states)[np.argsort(steps, kind='stable')])
+    final_states = np.concatenate([trajectory.final_states for trajectory in trajectories])
+    joined = {name: _beside(parts) for name, parts in zip(Trajectory._fields, zip(*trajectories)) if name != 'final_states'}
+    return Trajectory(final_states=final_states[np.argsort(steps, kind='stable')], **joined)
+
+
+def _beside(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    """The groups' arrays [T, W, ...] beside each other. What no group has there is not; a task has it in all or in none."""
+    return None if parts[0] is None else np.concatenate(parts, axis=1)

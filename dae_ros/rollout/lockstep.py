@@ -46,8 +46,10 @@ def check_stamp(stamp: Stamp, request: RolloutRequest | None, own_run: int) -> N
                       f'{stamp.order}, under way is {request.order}')
 
 
-def check_action(action: Action, num_agents: int, num_worlds: int, num_actions: int, policy_version: int) -> None:
-    """Refuses an action no honest agent of this team can have sent. Shapes as in `types.Action`."""
+def check_action(action: Action, num_agents: int, num_worlds: int, num_actions: int, policy_version: int,
+                 available: np.ndarray | None = None) -> None:
+    """Refuses an action no honest agent of this team can have sent. Shapes as in `types.Action`; available: [W, A] bool, as
+    far as it is known."""
     if action.robot >= num_agents:
         raise Refused(Refused.WRONG_ROBOT, f'robot {action.robot} of a team of {num_agents}')
     if action.policy_version != policy_version:
@@ -64,6 +66,14 @@ def check_action(action: Action, num_agents: int, num_worlds: int, num_actions: 
         raise Refused(Refused.OUT_OF_RANGE, f'action {action.actions.max()} of {num_actions}')
     if (action.probabilities[np.arange(num_worlds), action.actions] <= 0).any():
         raise Refused(Refused.OUT_OF_RANGE, 'an action was chosen that has probability 0')
+    if available is not None and action.probabilities[~available].any():
+        raise Refused(Refused.OUT_OF_RANGE, 'an action that is not available has a probability')
+
+
+def check_available(available: np.ndarray | None) -> None:
+    """Refuses flags [..., A] that leave a robot nothing to do."""
+    if available is not None and not available.any(axis=-1).all():
+        raise Refused(Refused.OUT_OF_RANGE, 'a robot has no action it may choose')
 
 
 class WorldEnd:
@@ -78,14 +88,16 @@ class WorldEnd:
         self.run = run
         self.request: RolloutRequest | None = None
         self._step = 0
+        self._seen: JointObservation | None = None  # what the step under way began with
         self._actions: dict[int, np.ndarray] = {}
 
     @property
     def waiting_for(self) -> list[int]:
-        """Robots whose action for the current step is missing; empty between rollouts."""
+        """Robots whose action for the current step is missing; empty between rollouts. Nobody waits for a robot that has left
+        its team in every world."""
         if self.request is None or self._step == self.request.num_steps:
             return []
-        return [robot for robot in range(self._worlds.spec.num_agents) if robot not in self._actions]
+        return [robot for robot in self._asked() if robot not in self._actions]
 
     def on_request(self, request: RolloutRequest) -> list[WorldDatum]:
         """Begins a rollout, or begins it anew; the data of its first step."""
@@ -102,14 +114,20 @@ class WorldEnd:
         if action.stamp.step > self._step or self._step == self.request.num_steps:
             raise Refused(Refused.UNEXPECTED, f'step {action.stamp.step}, under way is step {self._step}')
         spec = self._worlds.spec
-        check_action(action, spec.num_agents, self._worlds.num_worlds, spec.num_actions, self.request.policy_version)
+        available = None if self._seen.available is None or action.robot >= spec.num_agents else (
+            self._seen.available[:, action.robot])
+        check_action(action, spec.num_agents, self._worlds.num_worlds, spec.num_actions, self.request.policy_version, available)
         self._actions[action.robot] = action.actions
-        if len(self._actions) < spec.num_agents:
-            return []
-        joint = np.stack([self._actions[robot] for robot in range(spec.num_agents)], axis=1)
-        transition = self._worlds.step(joint.astype(np.int64))
+        return [] if self.waiting_for else self._advance()
+
+    def _advance(self) -> list[WorldDatum]:
+        """Steps the worlds with the actions there are; robots that have left everywhere do nothing."""
+        joint = np.zeros((self._worlds.num_worlds, self._worlds.spec.num_agents), np.int64)
+        for robot, actions in self._actions.items():
+            joint[:, robot] = actions
+        transition = self._worlds.step(joint)
         reward = SharedReward(self._stamp(), transition.reward, transition.terminated, transition.truncated,
-                              transition.final_states)
+                              transition.final_states, transition.won)
         self._step += 1
         self._actions = {}
         return [reward, *self._show(transition.next)]
@@ -122,14 +140,22 @@ class WorldEnd:
 
         The agents come first: they are on the critical path, the trainer is not.
         """
+        self._seen = seen
         stamp = self._stamp()
-        joint = JointState(stamp, seen.episode_start, seen.observations, seen.state)
+        joint = JointState(stamp, seen.episode_start, seen.observations, seen.state, seen.available, seen.present)
         if self._step == self.request.num_steps:
             return [joint]
         observations = [Observation(stamp, robot, self.request.policy_version, seen.episode_start,
-                                    np.ascontiguousarray(seen.observations[:, robot]))
-                        for robot in range(self._worlds.spec.num_agents)]
+                                    np.ascontiguousarray(seen.observations[:, robot]),
+                                    None if seen.available is None else seen.available[:, robot],
+                                    None if seen.present is None else seen.present[:, robot])
+                        for robot in self._asked()]
         return [*observations, joint]
+
+    def _asked(self) -> list[int]:
+        """Robots that have a say in the step under way: those that have not left their team in every world."""
+        present = self._seen.present
+        return [robot for robot in range(self._worlds.spec.num_agents) if present is None or present[:, robot].any()]
 
 
 class AgentEnd:
@@ -186,12 +212,13 @@ class AgentEnd:
             raise Refused(Refused.WRONG_ROBOT, f'observation of robot {observation.robot}, this is robot {self.robot}')
         if not np.isfinite(observation.values).all():
             raise Refused(Refused.NOT_FINITE, 'an observation is not a finite number')
+        check_available(observation.available)
         request = self.request
         if request is None or stamp.order > request.order:
             self._early = observation
             return None
         check_stamp(stamp, request, self.run)
-        if stamp.step != self._next_step:
+        if stamp.step < self._next_step or stamp.step > self._next_step and not _comes_back(observation):
             raise Refused(Refused.DUPLICATE if stamp.step < self._next_step else Refused.UNEXPECTED,
                           f'step {stamp.step}, expected step {self._next_step}')
         if observation.policy_version != request.policy_version:
@@ -214,9 +241,18 @@ class AgentEnd:
         if pending.values.shape[1] != policy.architecture.observation_size:
             raise Refused(Refused.WRONG_SHAPE, f'{pending.values.shape[1]} features, the policy takes '
                                                f'{policy.architecture.observation_size}')
+        if pending.available is not None and pending.available.shape[1] != policy.architecture.num_actions:
+            raise Refused(Refused.WRONG_SHAPE, f'{pending.available.shape[1]} actions, the policy has '
+                                               f'{policy.architecture.num_actions}')
         state = policy.initial_state(len(pending.values)) if self._state is None else self._state
-        probabilities, self._state = policy.act(pending.values, state, pending.episode_start)
+        probabilities, self._state = policy.act(pending.values, state, pending.episode_start, pending.available)
         seed = draws.group_seed(request.seed, self._group)
         actions = choose(probabilities, request.greedy, seed, request.rollout, pending.stamp.step, self.robot)
-        self._next_step += 1
+        self._next_step = pending.stamp.step + 1
         return Action(pending.stamp, self.robot, pending.policy_version, actions, probabilities)
+
+
+def _comes_back(observation: Observation) -> bool:
+    """Whether nothing from before matters: where the robot is present, an episode begins. It was asked nothing while it was
+    absent everywhere."""
+    return observation.present is not None and bool(observation.episode_start[observation.present].all())

@@ -36,8 +36,17 @@ def _array(field: array, *shape: int) -> np.ndarray:
     return np.frombuffer(field, _TYPECODES[field.typecode]).reshape(shape)
 
 
-def _flags(field: array, length: int) -> np.ndarray:
-    return _array(field, length) != 0
+def _flags(field: array, *shape: int) -> np.ndarray:
+    return _array(field, *shape) != 0
+
+
+def _optional_flags(field: array, *shape: int) -> np.ndarray | None:
+    """Flags of which there are none where they say nothing."""
+    return _flags(field, *shape) if len(field) else None
+
+
+def _optional_field(values: np.ndarray | None) -> array:
+    return array('B') if values is None else _field('B', values)
 
 
 def _stamp_message(stamp: Stamp) -> msg.Stamp:
@@ -52,13 +61,16 @@ def observation_message(observation: Observation) -> msg.Observation:
     num_worlds, size = observation.values.shape
     return msg.Observation(stamp=_stamp_message(observation.stamp), robot=observation.robot,
                            policy_version=observation.policy_version, num_worlds=num_worlds, observation_size=size,
-                           episode_start=_field('B', observation.episode_start), values=_field('f', observation.values))
+                           num_actions=0 if observation.available is None else observation.available.shape[1],
+                           episode_start=_field('B', observation.episode_start), values=_field('f', observation.values),
+                           available=_optional_field(observation.available), present=_optional_field(observation.present))
 
 
 def observation(message: msg.Observation) -> Observation:
     W, O = message.num_worlds, message.observation_size
     return Observation(_stamp(message.stamp), message.robot, message.policy_version, _flags(message.episode_start, W),
-                       _array(message.values, W, O))
+                       _array(message.values, W, O), _optional_flags(message.available, W, message.num_actions),
+                       _optional_flags(message.present, W))
 
 
 def action_message(action: Action) -> msg.Action:
@@ -78,29 +90,32 @@ def joint_state_message(joint: JointState, state_is_observations: bool) -> msg.J
     W, N, O = joint.observations.shape
     state = np.empty(0) if state_is_observations else joint.state
     return msg.JointState(stamp=_stamp_message(joint.stamp), num_worlds=W, num_agents=N, observation_size=O,
-                          state_size=joint.state.shape[1], episode_start=_field('B', joint.episode_start),
-                          observations=_field('f', joint.observations), state=_field('f', state))
+                          state_size=joint.state.shape[1], num_actions=0 if joint.available is None else joint.available.shape[2],
+                          episode_start=_field('B', joint.episode_start), observations=_field('f', joint.observations),
+                          state=_field('f', state), available=_optional_field(joint.available),
+                          present=_optional_field(joint.present))
 
 
 def joint_state(message: msg.JointState) -> JointState:
     W, N, O, S = message.num_worlds, message.num_agents, message.observation_size, message.state_size
     observations = _array(message.observations, W, N, O)
     state = _array(message.state, W, S) if len(message.state) else _array(message.observations, W, S)
-    return JointState(_stamp(message.stamp), _flags(message.episode_start, W), observations, state)
+    return JointState(_stamp(message.stamp), _flags(message.episode_start, W), observations, state,
+                      _optional_flags(message.available, W, N, message.num_actions), _optional_flags(message.present, W, N))
 
 
 def shared_reward_message(shared: SharedReward) -> msg.SharedReward:
     return msg.SharedReward(stamp=_stamp_message(shared.stamp), num_worlds=len(shared.reward),
                             state_size=shared.final_states.shape[1], reward=_field('f', shared.reward),
                             terminated=_field('B', shared.terminated), truncated=_field('B', shared.truncated),
-                            final_states=_field('f', shared.final_states))
+                            final_states=_field('f', shared.final_states), won=_optional_field(shared.won))
 
 
 def shared_reward(message: msg.SharedReward) -> SharedReward:
     W, S = message.num_worlds, message.state_size
     truncated = _flags(message.truncated, W)
     return SharedReward(_stamp(message.stamp), _array(message.reward, W), _flags(message.terminated, W), truncated,
-                        _array(message.final_states, int(truncated.sum()), S))
+                        _array(message.final_states, int(truncated.sum()), S), _optional_flags(message.won, W))
 
 
 def rollout_request_message(request: RolloutRequest) -> msg.RolloutRequest:

@@ -8,9 +8,11 @@ from collections.abc import Callable
 from dae_ros.config import TaskSettings
 from dae_ros.errors import SettingsError
 from dae_ros.types import WorldSpec
+from dae_ros.worlds import pettingzoo, smax
 from dae_ros.worlds.base import JointObservation, Transition, Worlds
 from dae_ros.worlds.matrix_game import MatrixGame
-from dae_ros.worlds.pettingzoo import PREFIX, PettingZooWorlds
+from dae_ros.worlds.pettingzoo import PettingZooWorlds
+from dae_ros.worlds.smax import SmaxWorlds
 from dae_ros.worlds.tasks import Formation, Line, Navigation
 
 __all__ = ['BUILT_IN', 'JointObservation', 'Transition', 'Worlds', 'make_worlds', 'side_by_side', 'world_spec']
@@ -20,6 +22,11 @@ BUILT_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
     'formation': Formation,
     'line': Line,
     'matrix_game': MatrixGame,
+}
+
+PLUGGED_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
+    pettingzoo.PREFIX: PettingZooWorlds,
+    smax.PREFIX: SmaxWorlds,
 }
 
 
@@ -32,9 +39,10 @@ def make_worlds(task: TaskSettings) -> Worlds:
     task = side_by_side(task, task.worlds_per_group)
     if task.task in BUILT_IN:
         return BUILT_IN[task.task](task)
-    if task.task.startswith(PREFIX):
-        return PettingZooWorlds(task)
-    raise SettingsError(f'unknown task {task.task!r}; there are {", ".join(BUILT_IN)} and {PREFIX}MODULE')
+    for prefix, make in PLUGGED_IN.items():
+        if task.task.startswith(prefix):
+            return make(task)
+    raise SettingsError(f'unknown task {task.task!r}; there are {", ".join(BUILT_IN)}, pettingzoo:MODULE and smax:MAP')
 
 
 def world_spec(task: TaskSettings) -> WorldSpec:

@@ -20,6 +20,8 @@ class JointObservation(NamedTuple):
     observations: np.ndarray   # [W, N, O] float32
     state: np.ndarray          # [W, S] float32
     episode_start: np.ndarray  # [W] bool
+    available: np.ndarray | None = None  # [W, N, A] bool: actions each robot may choose, one at least; None: all
+    present: np.ndarray | None = None    # [W, N] bool: who has not left the team; one who has may only choose action 0
 
 
 class Transition(NamedTuple):
@@ -30,6 +32,7 @@ class Transition(NamedTuple):
     truncated: np.ndarray      # [W] bool, never both
     final_states: np.ndarray   # [K, S] float32, last states of the K truncated episodes, in the order of the worlds
     next: JointObservation
+    won: np.ndarray | None = None  # [W] bool: episodes that ended with a victory; None: none
 
 
 class Worlds(ABC):
@@ -44,7 +47,8 @@ class Worlds(ABC):
 
     @abstractmethod
     def step(self, actions: np.ndarray) -> Transition:
-        """Apply the joint actions, integers [W, N] in 0 .. A-1; worlds whose episode ends begin the next one."""
+        """Apply the joint actions, integers [W, N] in 0 .. A-1, of what is available; worlds whose episode ends begin the
+        next one. Those who have left the team do nothing, action 0, until their world's episode ends."""
 
     def close(self) -> None:
         """Release what the worlds hold outside Python's memory."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Iterator
 
@@ -24,8 +24,10 @@ class PettingZooWorlds(Worlds):
 
     - Observations are flattened to float32 and padded with zeros to the longest among the agents.
     - The state is the environment's `state()`; where there is none, the padded observations one after another.
-    - The team's reward is the mean of the agents' rewards.
-    - An episode is terminated if every agent is, truncated if all have ended and not all of them terminated.
+    - The team's reward is the mean of the agents' rewards; one that has left gets none.
+    - An agent that ends before the others has left the team: it observes zeros, and its action is not passed on.
+    - An episode ends with its last agents: terminated if these all are, truncated if not.
+    - Masks of actions are taken from `action_mask` in an agent's observation or info.
     - `N` and `max_cycles` are passed on to environments that take them (num_agents, and episode_steps if it is not 0).
     - Every episode is seeded from (seed, 'reset', rollout, step, world). Python's and NumPy's global generators, which
       some environments use, are seeded from (seed, 'global', rollout, step) while the environments run, and put back.
@@ -42,6 +44,7 @@ class PettingZooWorlds(Worlds):
         build = _find_parallel_env(task.task)
         self.num_worlds = task.num_worlds
         self._environments: list[Any] = []
+        self._present: list[list[str]] = [[] for _ in range(task.num_worlds)]  # who has not left, by world
         self._rollout_key: tuple[int, int] | None = None
         self._steps = 0
         try:
@@ -70,13 +73,13 @@ class PettingZooWorlds(Worlds):
             raise WorldError(f'the agents of {self._name} have different numbers of actions ({counts}); '
                              'they must all have the same')
         self._first_actions = [int(space.start) for space in actions]
-        self._spaces = [environment.observation_space(agent) for agent in self._agents]
-        if any(isinstance(space, spaces.Dict) and 'action_mask' in space.spaces for space in self._spaces):
-            raise WorldError(f'{self._name} masks actions, which is not supported')
+        self._spaces = [_without_mask(environment.observation_space(agent)) for agent in self._agents]
         try:
             observation_size = max(spaces.utils.flatdim(space) for space in self._spaces)
         except (NotImplementedError, ValueError) as error:
             raise WorldError(f'the observations of {self._name} cannot be flattened: {error}') from error
+        if observation_size == 0:
+            raise WorldError(f'{self._name} shows its agents nothing')
 
         environment.reset(seed=0)
         try:
@@ -90,79 +93,105 @@ class PettingZooWorlds(Worlds):
     def reset(self, seed: int, rollout: int) -> JointObservation:
         self._rollout_key = (seed, rollout)
         self._steps = 0
-        observations, state = self._empty()
+        shown = self._empty()
         with self._own_generators():
             for world in range(self.num_worlds):
-                self._begin_episode(world, observations[world], state[world])
-        return JointObservation(observations, state, np.ones(self.num_worlds, dtype=bool))
+                self._begin_episode(world, shown)
+        return _joint_observation(shown, np.ones(self.num_worlds, dtype=bool))
 
     def step(self, actions: np.ndarray) -> Transition:
-        """As `Worlds.step`. Raises ValueError on actions of another shape, type or range, and WorldError before `reset`
-        or when only some agents of an environment leave."""
+        """As `Worlds.step`. Raises ValueError on actions of another shape, type or range, and WorldError before `reset`."""
         if self._rollout_key is None:
             raise WorldError('the worlds must be reset before their first step')
         actions = check_actions(actions, self.num_worlds, self.spec) + np.array(self._first_actions)
         self._steps += 1
-        observations, state = self._empty()
+        shown = self._empty()
         reward = np.empty(self.num_worlds, dtype=np.float32)
         terminated, truncated = np.zeros((2, self.num_worlds), dtype=bool)
         final_states = []
         with self._own_generators():
             for world, environment in enumerate(self._environments):
-                joint_action = dict(zip(self._agents, actions[world].tolist()))
-                seen, rewards, terminations, truncations, _ = environment.step(joint_action)
-                reward[world] = sum(float(rewards[agent]) for agent in self._agents) / self.spec.num_agents
-                ended = [terminations[agent] or truncations[agent] for agent in self._agents]
-                if any(ended) and not all(ended):
-                    gone = self._agents[ended.index(True)]
-                    raise WorldError(f'{gone} left {self._name} before the others; members leaving is not supported')
-                terminated[world] = all(terminations[agent] for agent in self._agents)
-                truncated[world] = all(ended) and not terminated[world]
+                acting = self._present[world]
+                joint_action = {agent: action for agent, action in zip(self._agents, actions[world].tolist()) if agent in acting}
+                seen, rewards, terminations, truncations, infos = environment.step(joint_action)
+                reward[world] = sum(float(rewards[agent]) for agent in acting) / self.spec.num_agents
+                staying = [agent for agent in acting if not (terminations[agent] or truncations[agent])
+                           and agent in environment.agents]
+                terminated[world] = all(terminations[agent] for agent in acting)
+                truncated[world] = not staying and not terminated[world]
+                self._present[world] = staying
                 if not terminated[world]:
-                    self._show(world, seen, observations[world], state[world])
+                    self._show(world, staying or acting, seen, infos, shown)
                 if truncated[world]:
-                    final_states.append(state[world].copy())
-                if all(ended):
-                    self._begin_episode(world, observations[world], state[world])
+                    final_states.append(shown.state[world].copy())
+                if not staying:
+                    self._begin_episode(world, shown)
         return Transition(reward, terminated, truncated,
                           np.array(final_states, dtype=np.float32).reshape(-1, self.spec.state_size),
-                          JointObservation(observations, state, terminated | truncated))
+                          _joint_observation(shown, terminated | truncated))
 
     def close(self) -> None:
         for environment in self._environments:
             environment.close()
         self._environments = []
 
-    def _empty(self) -> tuple[np.ndarray, np.ndarray]:
-        spec = self.spec
-        return (np.empty((self.num_worlds, spec.num_agents, spec.observation_size), dtype=np.float32),
-                np.empty((self.num_worlds, spec.state_size), dtype=np.float32))
+    def _empty(self) -> JointObservation:
+        W, (N, A, O, S, *_) = self.num_worlds, self.spec
+        return JointObservation(np.empty((W, N, O), np.float32), np.empty((W, S), np.float32), np.empty(W, bool),
+                                np.empty((W, N, A), bool), np.empty((W, N), bool))
 
     def _own_generators(self):
         seed, rollout = self._rollout_key
         return _private_global_generators(draws.key(seed, 'global', rollout, self._steps))
 
-    def _begin_episode(self, world: int, observations: np.ndarray, state: np.ndarray) -> None:
+    def _begin_episode(self, world: int, shown: JointObservation) -> None:
         seed, rollout = self._rollout_key
         environment = self._environments[world]
         seen, infos = environment.reset(seed=draws.key(seed, 'reset', rollout, self._steps, world) % 2**31)
         if set(environment.agents) != set(self._agents):
             raise WorldError(f'{self._name} begins an episode with {len(environment.agents)} of its '
-                             f'{self.spec.num_agents} agents; members leaving is not supported')
-        if any(isinstance(info, Mapping) and 'action_mask' in info for info in infos.values()):
-            raise WorldError(f'{self._name} masks actions, which is not supported')
-        self._show(world, seen, observations, state)
+                             f'{self.spec.num_agents} agents; all must be there')
+        self._present[world] = self._agents
+        self._show(world, self._agents, seen, infos, shown)
 
-    def _show(self, world: int, seen: Mapping[str, Any], observations: np.ndarray, state: np.ndarray) -> None:
-        """Write what the agents of a world see, and its state, into `observations` [N, O] and `state` [S]."""
+    def _show(self, world: int, present: Sequence[str], seen: Mapping[str, Any], infos: Mapping[str, Any],
+              shown: JointObservation) -> None:
+        """Write what the agents `present` in a world see and may do, and its state, into the world's part of `shown`."""
         from gymnasium import spaces
 
-        observations[:] = 0.0
-        for row, agent, space in zip(observations, self._agents, self._spaces):
-            values = seen[agent]
+        observations, available = shown.observations[world], shown.available[world]
+        observations[:], available[:] = 0.0, True
+        for row, agent, space, mask in zip(observations, self._agents, self._spaces, available):
+            if agent not in present:
+                mask[1:] = False
+                continue
+            values, info = seen[agent], infos.get(agent, {})
+            given = info.get('action_mask', values.get('action_mask') if isinstance(values, Mapping) else None)
+            if given is not None:
+                mask[:] = np.asarray(given).astype(bool)
+                if not mask.any():
+                    raise WorldError(f'{agent} of {self._name} has no action it may choose')
+            if isinstance(space, spaces.Dict):
+                values = {name: values[name] for name in space.spaces}
             flat = np.ravel(values) if isinstance(space, spaces.Box) else spaces.utils.flatten(space, values)
             row[:flat.size] = flat
-        state[:] = np.ravel(self._environments[world].state()) if self._has_state else np.ravel(observations)
+        shown.present[world] = [agent in present for agent in self._agents]
+        shown.state[world] = np.ravel(self._environments[world].state()) if self._has_state else np.ravel(observations)
+
+
+def _without_mask(space: Any) -> Any:
+    """An observation's space less its mask of actions."""
+    from gymnasium import spaces
+
+    if not isinstance(space, spaces.Dict) or 'action_mask' not in space.spaces:
+        return space
+    return spaces.Dict({name: part for name, part in space.spaces.items() if name != 'action_mask'})
+
+
+def _joint_observation(shown: JointObservation, episode_start: np.ndarray) -> JointObservation:
+    """What was written, without flags that say nothing."""
+    return shown._replace(episode_start=episode_start, available=None if shown.available.all() else shown.available,
+                          present=None if shown.present.all() else shown.present)
 
 
 def _find_parallel_env(task: str) -> Any:

@@ -445,6 +445,7 @@ typedef struct {
     uint8_t *start;
     int64_t *codes, *actions;
     float *of_loss[2], *weights;
+    uint8_t *available;
 } Scratch;
 
 /* GRU. */
@@ -845,11 +846,19 @@ static void fan_out_backward(const Step *step, const Work *work, long N, const f
     }
 }
 
-static float largest_of(long n, const float *x) {
-    float largest = x[0];
-    for (long i = 1; i < n; i++)
-        largest = x[i] > largest ? x[i] : largest;
+/* Of those that are `available`, which NULL says of all. */
+static float largest_of(long n, const float *x, const uint8_t *available) {
+    float largest = -INFINITY;
+    for (long i = 0; i < n; i++)
+        if (!available || available[i])
+            largest = x[i] > largest ? x[i] : largest;
     return largest;
+}
+
+static void zero_unavailable(long n, float *x, const uint8_t *available) {
+    if (available)
+        for (long i = 0; i < n; i++)
+            x[i] = available[i] ? x[i] : 0;
 }
 
 /* Losses: sums over weighted rows, each with its gradient. */
@@ -862,29 +871,31 @@ typedef struct {
     Array actions; /* [L, C, N] int64 for POLICY and REWARD */
     Array data[2]; /* POLICY: old log-probabilities, advantages [L, C, N]. VALUE: old values, targets [L, C].
                       REWARD: rewards [L, C] */
-    Array weights; /* [L, C] */
+    Array weights; /* [L, C, N]; VALUE: [L, C] */
+    Array available; /* POLICY: [L, C, N, A] bytes, 0 where an action cannot be chosen; NULL: all can */
 } Loss;
 
 /* -surrogate (eq. 4) - bonus * entropy, on T rows of A logits; numbers: clip, bonus.
  * To sums [4] is added: the negated surrogate, the entropy, the fraction of clipped ratios, -log ratio. */
-static void policy_loss(long T, long N, long A, const Loss *loss, const float *logits, float *grad, double *sums,
+static void policy_loss(long T, long A, const Loss *loss, const float *logits, float *grad, double *sums,
                         const Scratch *s) {
     const float clip = (float)loss->numbers[0], bonus = (float)loss->numbers[1];
     double surrogates = 0, entropies = 0, clipped = 0, divergences = 0;
     for (long row = 0; row < T; row++, logits += A, grad += A) {
-        const float largest = largest_of(A, logits);
+        const uint8_t *available = s->available ? s->available + row * A : NULL;
+        const float largest = largest_of(A, logits, available);
         vec total = all(0), expected = all(0);
+        FOR_EACH_VECTOR(A, { store_upto(grad + j, exp_of(load_upto(logits + j, lanes) - all(largest), 87), lanes); });
+        zero_unavailable(A, grad, available);
         FOR_EACH_VECTOR(A, {
-            vec apart = load_upto(logits + j, lanes) - all(largest);
-            store_upto(grad + j, exp_of(apart, 87), lanes);
             vec e = load_upto(grad + j, lanes); /* nothing beyond the last action */
             total += e;
-            expected += e * apart;
+            expected += e * (load_upto(logits + j, lanes) - all(largest));
         });
         const float sum = sum_of(total), log_sum = logf(sum), entropy = log_sum - sum_of(expected) / sum;
         const long action = s->actions[row];
         const float log_ratio = logits[action] - largest - log_sum - s->of_loss[0][row], ratio = expf(log_ratio);
-        const float advantage = s->of_loss[1][row], weight = s->weights[row / N];
+        const float advantage = s->of_loss[1][row], weight = s->weights[row];
         const float free = ratio * advantage, held = fminf(fmaxf(ratio, 1 - clip), 1 + clip) * advantage;
         const int clipped_away = held < free; /* not within the clip range, where the two are one, nor for a NaN */
         const float push = clipped_away ? 0 : free;
@@ -932,7 +943,7 @@ static void reward_loss(long T, long N, long A, const float *predicted, float *g
     memset(grad, 0, (size_t)(T * A) * sizeof(float));
     for (long row = 0; row < T; row++) {
         const long at = row * A + s->actions[row];
-        const float error = predicted[at] - s->of_loss[0][row / N], weight = s->weights[row / N];
+        const float error = predicted[at] - s->of_loss[0][row / N], weight = s->weights[row];
         sums[0] += (double)(error * error * weight) / 2;
         grad[at] = error * weight;
     }
@@ -1044,7 +1055,8 @@ static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *ba
     s.actions = take_bytes(arena, all_rows * (long)sizeof(int64_t));
     s.of_loss[0] = take(arena, all_rows);
     s.of_loss[1] = take(arena, all_rows);
-    s.weights = take(arena, length);
+    s.weights = take(arena, all_rows);
+    s.available = loss->available.data ? take_bytes(arena, all_rows * steps[count - 1].outputs) : NULL;
     return s;
 }
 
@@ -1085,9 +1097,10 @@ static void rows_backward(const Step *step, const Work *work, const Batch *batch
         layer_backward(step, work, x, grad_y, grad_x, s);
 }
 
-/* Gathers what belongs to a block of columns and takes it through the first `count` steps. */
-static void forward_block(const Step *steps, long count, const Batch *batch, const Loss *loss, long first, long columns,
-                          Work *works, Scratch *s) {
+/* Gathers what belongs to a block of columns, of a network with so many `outputs`, and takes it through the first `count`
+ * steps. */
+static void forward_block(const Step *steps, long count, long outputs, const Batch *batch, const Loss *loss, long first,
+                          long columns, Work *works, Scratch *s) {
     const long L = batch->length, C = batch->columns, N = batch->agents, size = (long)sizeof(float);
     gather(&batch->inputs, L, first, columns, batch->rows * steps[0].inputs * size, s->inputs);
     if (batch->codes.data)
@@ -1097,7 +1110,9 @@ static void forward_block(const Step *steps, long count, const Batch *batch, con
             for (long at = (t * C + first) * N; at < (t * C + first + columns) * N; at++)
                 s->codes[row++] = at;
     if (loss) {
-        gather(&loss->weights, L, first, columns, size, s->weights);
+        gather(&loss->weights, L, first, columns, loss->kind == VALUE ? size : N * size, s->weights);
+        if (loss->available.data)
+            gather(&loss->available, L, first, columns, N * outputs, s->available);
         for (int i = 0; i < 2; i++)
             if (loss->data[i].data)
                 gather(&loss->data[i], L, first, columns, loss->kind == POLICY ? N * size : size, s->of_loss[i]);
@@ -1147,10 +1162,12 @@ static void run_part(const Step *steps, long from, long count, const Batch *batc
     s.actions += at * N;
     s.of_loss[0] += at * per_step;
     s.of_loss[1] += at * per_step;
-    s.weights += at;
+    s.weights += at * (loss->kind == VALUE ? 1 : N);
+    if (s.available)
+        s.available += at * N * steps[last].outputs;
     const long rows = size * own[last].rows, outputs = steps[last].outputs;
     if (loss->kind == POLICY)
-        policy_loss(rows, N, outputs, loss, own[last].y, grad, sums, &s);
+        policy_loss(rows, outputs, loss, own[last].y, grad, sums, &s);
     else if (loss->kind == VALUE)
         value_loss(rows, loss, own[last].y, grad, sums, &s);
     else
@@ -1204,7 +1221,7 @@ static int run(const Step *steps, long count, void *packed, const Batch *batch, 
         pack_weights(steps, count, learns, works);
     for (long first = 0; first < C; first += block) {
         const long columns = min(block, C - first);
-        forward_block(steps, in_parts, batch, loss, first, columns, works, &s);
+        forward_block(steps, in_parts, steps[count - 1].outputs, batch, loss, first, columns, works, &s);
         for (long at = 0; at < L * columns; at += part)
             run_part(steps, in_parts, count, batch, loss, at, min(part, L * columns - at), works, grad_table, sums, &s);
         if (loss)
@@ -1233,15 +1250,15 @@ int network_gradient(const Step *steps, long count, const Batch *batch, const Lo
 
 /* Acting. */
 
-/* Each row of A scores to their exponentials over the sum of these. */
-static void softmax(long rows, long A, float *scores) {
+/* Each row of A scores to their exponentials over the sum of these, those of what is not `available` [rows, A] to zeros. */
+static void softmax(long rows, long A, const uint8_t *available, float *scores) {
     for (long row = 0; row < rows; row++, scores += A) {
-        const vec largest = all(largest_of(A, scores));
+        const uint8_t *own = available ? available + row * A : NULL;
+        const vec largest = all(largest_of(A, scores, own));
         vec total = all(0);
-        FOR_EACH_VECTOR(A, {
-            store_upto(scores + j, exp_of(load_upto(scores + j, lanes) - largest, 87), lanes);
-            total += load_upto(scores + j, lanes); /* nothing beyond the last action */
-        });
+        FOR_EACH_VECTOR(A, { store_upto(scores + j, exp_of(load_upto(scores + j, lanes) - largest, 87), lanes); });
+        zero_unavailable(A, scores, own);
+        FOR_EACH_VECTOR(A, { total += load_upto(scores + j, lanes); }); /* nothing beyond the last action */
         const vec inverse = all(1 / sum_of(total));
         FOR_EACH_VECTOR(A, { store_upto(scores + j, load_upto(scores + j, lanes) * inverse, lanes); });
     }
@@ -1262,14 +1279,15 @@ long policy_pack(const Step *steps, long count, void *memory) {
     return 63 + (long)arena.used;
 }
 
-/* Probabilities [W, A] of the actions and the next states [W, H], for observations [W, O], states [W, H] and episode
- * starts [W] of W worlds; `packed` by policy_pack. A world's bits do not depend on the others. */
+/* Probabilities [W, A] of the actions and the next states [W, H], for observations [W, O], states [W, H], episode starts
+ * [W] and the actions `available` [W, A], NULL for all, of W worlds; `packed` by policy_pack. A world's bits do not depend
+ * on the others. */
 int policy_act(const Step *steps, long count, void *packed, long worlds, const float *observations, const float *states,
-               const uint8_t *episode_start, float *probabilities, float *next_states) {
+               const uint8_t *episode_start, const uint8_t *available, float *probabilities, float *next_states) {
     const Batch batch = {.length = 1, .columns = worlds, .agents = 1, .rows = 1, .inputs = {observations, worlds, 1},
                          .start = {episode_start, worlds, 1}, .initial = states};
     if (run(steps, count, aligned(packed), &batch, NULL, probabilities, next_states, NULL, NULL))
         return 1;
-    softmax(worlds, steps[count - 1].outputs, probabilities);
+    softmax(worlds, steps[count - 1].outputs, available, probabilities);
     return 0;
 }

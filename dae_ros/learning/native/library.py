@@ -38,7 +38,7 @@ class CBatch(ctypes.Structure):
 
 class CLoss(ctypes.Structure):
     _fields_ = [('kind', ctypes.c_long), ('numbers', ctypes.c_double * 3), ('actions', CArray), ('data', CArray * 2),
-                ('weights', CArray)]
+                ('weights', CArray), ('available', CArray)]
 
 
 def c_step(kind: str, activation: str, inputs: int, outputs: int, addresses: Iterable[int | None]) -> CStep:
@@ -66,5 +66,5 @@ def opened(path: os.PathLike | str) -> ctypes.CDLL:
     loaded.network_forward.argtypes = [steps, count, batch, address, address]
     loaded.network_gradient.argtypes = [steps, count, batch, ctypes.POINTER(CLoss), address, address]
     loaded.policy_pack.argtypes, loaded.policy_pack.restype = [steps, count, address], ctypes.c_long
-    loaded.policy_act.argtypes = [address, count, address, ctypes.c_long, *[address] * 5]
+    loaded.policy_act.argtypes = [address, count, address, ctypes.c_long, *[address] * 6]
     return loaded
