@@ -1,8 +1,8 @@
 """make bench: what we reach on this machine; kept in benchmarks/results.json and drawn in docs/.
 
 Parts: training (one process, with its phases), graph (beside the single process), learner (arithmetic beside the matrix
-peak), worlds (simulators), inference (one robot), execution (the same through its node, over DDS); scale (as the work grows)
-and bags, which take long and must be named.
+peak), worlds (simulators), inference (one robot), execution (the same through its node, over DDS); scale (as the work grows),
+bags, and memory (of the graph's processes, as updates pass), which take long and must be named.
 """
 
 from __future__ import annotations
@@ -60,6 +60,15 @@ def simulators(rounds: int) -> dict[str, Any]:
     return result
 
 
+def memory(_: int) -> dict[str, Any]:
+    """Resident memory of the graph's processes over 2,000 updates; needs ROS."""
+    from benchmarks import memory as benchmark
+
+    result = benchmark.measure()
+    print(benchmark.as_text(result))
+    return result
+
+
 def one_robot(rounds: int) -> dict[str, float]:
     result = inference.measure()
     print(f'  {result["median"]:.0f} us, 99th percentile {result["percentile_99"]:.0f} us')
@@ -78,8 +87,9 @@ def one_agent(rounds: int) -> dict[str, float]:
 
 PARTS: dict[str, Callable[[int], Any]] = {
     'training': training, 'graph': graph, 'learner': lambda rounds: learner.measure(repeats=rounds + 2), 'worlds': simulators,
-    'inference': one_robot, 'execution': one_agent, 'scale': lambda rounds: scale.measure(), 'bags': bags.measure}
-UNASKED = tuple(name for name in PARTS if name not in ('scale', 'bags'))
+    'inference': one_robot, 'execution': one_agent, 'scale': lambda rounds: scale.measure(), 'bags': bags.measure,
+    'memory': memory}
+UNASKED = tuple(name for name in PARTS if name not in ('scale', 'bags', 'memory'))
 
 
 def plot(found: dict[str, dict[str, float]]) -> None:
@@ -109,7 +119,7 @@ PLOTS: dict[str, Callable[[Any], None]] = {'training': plot, 'scale': scale.plot
 def main() -> None:
     parser = argparse.ArgumentParser(prog='make bench', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('parts', nargs='*', metavar='part',
-                        help=f'which of {", ".join(PARTS)}; without any, all but scale and bags')
+                        help=f'which of {", ".join(PARTS)}; without any, all but scale, bags and memory')
     parser.add_argument('--rounds', type=int, default=3, help='turns of each training, graph and single process')
     options = parser.parse_args()
     unknown = set(options.parts) - set(PARTS)
