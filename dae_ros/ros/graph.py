@@ -117,8 +117,9 @@ def node_environment() -> dict[str, str]:
     """Environment variables for the nodes where the user has set none: this host only, and quick discovery."""
     reach = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
     # SYSTEM_DEFAULT leaves it to the profile; LOCALHOST would overrule it and let only 32 processes find each other.
-    defaults = {reach: 'LOCALHOST' if _PROFILES in os.environ else 'SYSTEM_DEFAULT',
-                _PROFILES: _profiles('fastdds.xml' if reach in os.environ else 'fastdds_this_host.xml')}
+    chosen = any(name in os.environ for name in (reach, _PROFILES, 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER'))
+    defaults = ({reach: 'LOCALHOST', _PROFILES: _profiles('fastdds.xml')} if chosen else
+                {reach: 'SYSTEM_DEFAULT', _PROFILES: _profiles('fastdds_this_host.xml')})
     return {name: os.environ.get(name, value) for name, value in defaults.items()}
 
 

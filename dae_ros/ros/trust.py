@@ -30,4 +30,6 @@ def reaches_beyond_this_host(environment: Mapping[str, str]) -> bool:
         return False
     if any(environment.get(name) for name in ('ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER')):
         return True
+    if discovery_range == 'SYSTEM_DEFAULT':  # then the profile decides
+        return not Path(environment.get('FASTRTPS_DEFAULT_PROFILES_FILE', '')).stem.startswith('fastdds_this_host')
     return discovery_range != 'LOCALHOST' and environment.get('ROS_LOCALHOST_ONLY') != '1'

@@ -122,7 +122,7 @@ def catches_interrupts(process) -> bool:
 
 MOMENTS = {
     'as soon as it can hear': catches_interrupts,
-    'while nodes are started': lambda process: processes_naming('__node:=agent_0'),
+    'while nodes are started': lambda process: processes_naming('dae_ros_nodes.agent'),
     'when the last node has begun': lambda process: processes_naming('__node:=trainer'),
 }
 

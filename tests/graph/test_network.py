@@ -8,7 +8,7 @@ import time
 from typing import Callable
 
 import pytest
-from harness import SMALL, TIMEOUT, Graph, oracle
+from harness import REPOSITORY, SMALL, TIMEOUT, Graph, oracle
 from link import CLEAR, CUT, Link, Weather
 
 pytestmark = pytest.mark.slow
@@ -23,6 +23,7 @@ SERVER = '10.77.0.2:11811'
 @pytest.fixture
 def link(domain, monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
+    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(REPOSITORY / 'config' / 'fastdds.xml'))
     try:
         made = Link().__enter__()
     except OSError as error:

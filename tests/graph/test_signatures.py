@@ -17,7 +17,7 @@ from dae_ros.ros import convert, names, qos
 from dae_ros.ros.trust import UNSIGNED, reaches_beyond_this_host
 from dae_ros.weights.codec import decode_policy, encode_policy, open_weights, seal
 
-VALUES = {**SMALL, 'total_steps': 12 * 8 * 25}
+VALUES = {**SMALL, 'total_steps': 12 * 8 * 25, 'robots_per_process': 1}
 KEY, OTHER_KEY = os.urandom(32), os.urandom(32)
 
 
@@ -71,6 +71,8 @@ def test_weights_that_the_team_s_trainer_did_not_sign_are_refused_by_all_and_a_s
 
 @pytest.mark.parametrize('discovery, beyond', [
     ({}, True), ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, True), ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}, False),
+    ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT'}, True),
+    ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT', 'FASTRTPS_DEFAULT_PROFILES_FILE': '/x/fastdds_this_host.xml'}, False),
     ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}, False), ({'ROS_LOCALHOST_ONLY': '1'}, False), ({'ROS_LOCALHOST_ONLY': '0'}, True),
     ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_STATIC_PEERS': '192.0.2.1'}, True),
     ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DISCOVERY_SERVER': '192.0.2.1:11811'}, True)], ids=str)
