@@ -38,7 +38,8 @@ from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 
 WARM_UP = 3      # updates
-TIMEOUT = 600.0  # s without any news of the graph
+TIMEOUT = 600.0  # s for whatever is waited for
+ANSWER_TIMEOUT = 5.0  # s after which a service is asked again
 GRAPHS = {'graph': 0, 'agents_apart': 1}  # robots per process
 
 
@@ -73,17 +74,25 @@ def run_graph(settings: Settings, path: Path, updates: int, bag: Path | None = N
         nonlocal recorder
         recorder = next((status.message for status in report.status if status.name == '/recorder'), recorder)
 
-    def spin_until(condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + TIMEOUT
-        while not condition():
-            if codes or time.monotonic() > deadline:
-                raise RuntimeError(f'the graph stood still, exit codes {codes}; its logs are in {path / "logs"}')
+    def spin_until(condition: Callable[[], bool], limit: float = TIMEOUT) -> bool:
+        """Whether the condition holds within so many seconds."""
+        deadline = time.monotonic() + limit
+        while not condition() and time.monotonic() < deadline:
+            if codes:
+                raise RuntimeError(f'a node ended, exit codes {codes}; the logs are in {path / "logs"}')
             executor.spin_once(timeout_sec=1.0)
+        return condition()
+
+    def expect(condition: Callable[[], bool]) -> None:
+        if not spin_until(condition):
+            raise RuntimeError(f'the graph stood still; its logs are in {path / "logs"}')
 
     def call(name: str) -> None:
+        """Asks again where the answer was dropped, as it may be for a client that has just been met."""
         client = node.create_client(Trigger, name)
-        spin_until(client.service_is_ready)
-        spin_until(client.call_async(Trigger.Request()).done)
+        expect(client.service_is_ready)
+        while not spin_until(client.call_async(Trigger.Request()).done, ANSWER_TIMEOUT):
+            pass
 
     rclpy.init(args=[])
     node = rclpy.create_node('benchmark', start_parameter_services=False)
@@ -102,9 +111,9 @@ def run_graph(settings: Settings, path: Path, updates: int, bag: Path | None = N
             if bag is not None and process.name == 'trainer':
                 call(names.PAUSE)
         if bag is not None:
-            spin_until(lambda: recorder == 'recording')
+            expect(lambda: recorder == 'recording')
             call(names.RESUME)
-        spin_until(lambda: newest >= updates)
+        expect(lambda: newest >= updates)
     finally:
         supervisor.stop()
         rclpy.try_shutdown()

@@ -21,6 +21,7 @@ from dae_ros.worlds import make_worlds
 
 SCHEMAS = ROOT / 'msg_schemas' / 'msg'
 FOLDER = 'pretrained'  # beside the runs
+MOST_EPOCHS = 10  # passes over the bag: some minutes in one thread; a little more is to be had for very much more
 OF_THE_RUN_ALONE = {'reward_network.path': '', 'reward_network.freeze': False, 'total_steps': 1}  # nothing of it enters here
 
 
@@ -60,7 +61,7 @@ def _played(settings: Settings, steps: int, check: Callable[[], None]) -> Iterat
 
 
 def _trained(bag: Path, settings: Settings, check: Callable[[], None]) -> bytes:
-    training = RewardTraining(Dataset(bag), settings, RewardTrainingSettings(), lambda done, total: check())
+    training = RewardTraining(Dataset(bag), settings, RewardTrainingSettings(max_epochs=MOST_EPOCHS), lambda done, total: check())
     try:
         for epoch in training.run():
             print(f'epoch {epoch.number}: held-out error {epoch.held_out_error:.4g}, that of the mean reward is '

@@ -24,9 +24,9 @@ Controller = Callable[[Worlds, JointObservation, np.random.Generator], np.ndarra
 def yardstick_returns(task: TaskSettings, num_episodes: int, seed: int) -> dict[str, tuple[float, float]]:
     """Mean return and its standard error over `num_episodes` episodes for each untrained team that fits the task.
 
-    'no-op' always takes the first action available, 'random' draws uniformly among these. Particle tasks add 'greedy', a centralised controller that
-    sees everything (`greedy_actions`; a yardstick, not a bound), the matrix game 'best', its optimum. All teams play
-    the same episodes. The standard error of a single episode is nan. Raises as `make_worlds`.
+    'no-op' always takes the first action available, 'random' draws uniformly among these. Particle tasks add 'greedy', a
+    centralised controller that sees everything (`greedy_actions`; a yardstick, not a bound), the matrix game 'best', its
+    optimum. All teams play the same episodes. The standard error of a single episode is nan. Raises as `make_worlds`.
     """
     if num_episodes < 1:
         raise ValueError(f'num_episodes must be at least 1, not {num_episodes}')
