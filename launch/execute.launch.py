@@ -12,8 +12,8 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironment
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from dae_ros.ros.execution import execution_graph, find_policy, read_values, write_values
-from dae_ros.ros.graph import find_task_file, node_environment
+from dae_ros.ros.execution import execution_graph, find_policy, write_values
+from dae_ros.ros.graph import find_task_file, node_environment, read_values
 from launch import LaunchDescription
 
 RESPAWN_DELAY = 2.0  # s

@@ -13,8 +13,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from dae_ros.restarts import Restarts, describe
-from dae_ros.ros.execution import read_values, run_settings, streaming_graph
-from dae_ros.ros.graph import find_task_file, node_environment
+from dae_ros.ros.execution import streaming_graph
+from dae_ros.ros.graph import find_task_file, node_environment, read_settings, read_values
 from dae_ros.run_folder import RunFolder
 from launch import LaunchDescription
 
@@ -26,8 +26,8 @@ def start(context) -> list:
     names = ('task_file', 'namespace', 'run_folder', 'simulate', 'parameters')
     argument = {name: LaunchConfiguration(name).perform(context) for name in names}
     task_file = find_task_file(argument['task_file'])
-    values = read_values(task_file, argument['parameters'].split())
-    settings = run_settings(values)
+    overrides = argument['parameters'].split()
+    settings, values = read_settings(task_file, overrides), read_values(task_file, overrides)
     path = argument['run_folder'] or f'runs/{task_file.stem}-{datetime.now():%Y%m%d-%H%M%S}'
     folder = RunFolder(Path(path).absolute(), settings)
     restarts = Restarts(settings.run.max_restarts)

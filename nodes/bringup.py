@@ -73,14 +73,14 @@ def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, key_fi
     GraphRun(settings, folder, namespace, display, training_graph(settings, folder, key_file)).run()
 
 
-def train_on_robots(arguments: argparse.Namespace, folder: RunFolder, display: ProgressDisplay) -> None:
+def train_on_robots(settings: Settings, folder: RunFolder, arguments: argparse.Namespace, display: ProgressDisplay) -> None:
     """The run as a stream of what robots do. Raises DaeRosError when it cannot go on."""
-    from dae_ros.ros.execution import read_values, run_settings, streaming_graph
+    from dae_ros.ros.execution import streaming_graph
+    from dae_ros.ros.graph import read_values
     from dae_ros.ros.graph_run import GraphRun
 
-    values = read_values(task_file_of(arguments), arguments.parameter)
-    settings = run_settings(values)
-    GraphRun(settings, folder, arguments.namespace, display, streaming_graph(settings, values, folder, arguments.simulate)).run()
+    processes = streaming_graph(settings, read_values(task_file_of(arguments), arguments.parameter), folder, arguments.simulate)
+    GraphRun(settings, folder, arguments.namespace, display, processes).run()
 
 
 def task_file_of(arguments: argparse.Namespace) -> Path | None:
@@ -89,21 +89,11 @@ def task_file_of(arguments: argparse.Namespace) -> Path | None:
     return find_task_file(arguments.task_file) if arguments.task_file else None
 
 
-def read_run_settings(task_file: Path | None, arguments: argparse.Namespace) -> Settings:
-    """The settings of the training; where robots take part, theirs may stand among them."""
-    if not arguments.stream:
-        from dae_ros.ros.graph import read_settings
-
-        return read_settings(task_file, arguments.parameter)
-    from dae_ros.ros.execution import read_values, run_settings
-
-    return run_settings(read_values(task_file, arguments.parameter))
-
-
 def execute(arguments: argparse.Namespace) -> None:
     """Drives robots until Ctrl-C."""
-    from dae_ros.ros.execution import execution_graph, find_policy, read_values, write_values
+    from dae_ros.ros.execution import execution_graph, find_policy, write_values
     from dae_ros.ros.execution_run import ExecutionRun
+    from dae_ros.ros.graph import read_values
 
     values = read_values(task_file_of(arguments), arguments.parameter)
     folder = arguments.run_folder or Path('runs') / f'execution-{datetime.now():%Y%m%d-%H%M%S}'
@@ -128,17 +118,18 @@ def bring_up(arguments: argparse.Namespace) -> int:
     # Here, because it takes a second in which Ctrl-C is to be heard.
     from dae_ros.report.progress import ProgressDisplay
     from dae_ros.report.summary import Summary
+    from dae_ros.ros.graph import read_settings
     from dae_ros.run_folder import RunFolder
 
     task_file = task_file_of(arguments)
-    settings = read_run_settings(task_file, arguments)
+    settings = read_settings(task_file, arguments.parameter)
     stem = task_file.stem if task_file else settings.task.task.replace(':', '_')
     path = arguments.run_folder or Path('runs') / f'{stem}-{datetime.now():%Y%m%d-%H%M%S}'
     folder = RunFolder(path, settings)
     with ProgressDisplay() as display:
         display.note(f'training in {path} (logs of the nodes in {path / "logs"})')
         if arguments.stream:
-            train_on_robots(arguments, folder, display)
+            train_on_robots(settings, folder, arguments, display)
         elif arguments.in_process:
             train_in_process(settings, folder, display)
         else:

@@ -203,8 +203,10 @@ def test_there_is_a_task_file_for_every_task_of_the_paper():
 @pytest.mark.parametrize('path', TASK_FILES, ids=lambda path: path.name)
 def test_every_task_file_loads_and_sets_what_it_says(path):
     values = config.load_task_file(path)
+    of_robots = {name: values.pop(name) for name in list(values) if name in config.ROBOT_SETTINGS}
     flattened = config.flatten(config.from_flat(values))
     assert values and {name: flattened[name] for name in values} == values
+    assert {name: config.ROBOT_SETTINGS[name].check(value) for name, value in of_robots.items()} == of_robots
 
 
 def test_a_task_file_may_nest_a_group_or_write_its_names_with_dots():

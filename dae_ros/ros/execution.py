@@ -3,35 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Iterable, Mapping
+from typing import Any
 
 import yaml
 
-from dae_ros import config
 from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
 from dae_ros.errors import SettingsError
 from dae_ros.robots.setup import task_settings
 from dae_ros.ros.graph import NodeProcess, shipped_config, training_graph
 from dae_ros.run_folder import RunFolder
 
-KNOWN = {**SETTINGS, **ROBOT_SETTINGS}
 NEEDED = {'seed', *(name for name, info in SETTINGS.items() if info.group == 'task'), *ROBOT_SETTINGS}
 FROM_SERVER = 'parameter_server'  # in place of a file: whatever the parameter server has
-
-
-def read_values(task_file: Path | None, overrides: Iterable[str]) -> dict[str, Any]:
-    """The task file's values with the `name:=value` overrides put in, by name, checked. Raises SettingsError."""
-    values = config.load_task_file(task_file) if task_file else {}
-    values.update(config.parse_override(text) for text in overrides)
-    for name in values:
-        if name not in KNOWN:
-            raise config.unknown_setting(name, KNOWN)
-    return {name: KNOWN[name].check(value) for name, value in values.items()}
-
-
-def run_settings(values: Mapping[str, Any]) -> Settings:
-    """Those of them that a training has."""
-    return config.from_flat({name: value for name, value in values.items() if name in SETTINGS})
 
 
 def find_policy(name: str) -> str:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Iterable, NamedTuple
+from typing import Any, Iterable, NamedTuple
 
 from dae_ros import config
-from dae_ros.config import Settings
+from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
 from dae_ros.errors import SettingsError
 from dae_ros.ros import names
 from dae_ros.run_folder import RunFolder
@@ -105,12 +105,22 @@ def shipped_config() -> Path:
 
 
 def read_settings(task_file: Path | None, overrides: Iterable[str]) -> Settings:
-    """The task file's settings with the `name:=value` overrides put in, checked as a whole. Raises SettingsError."""
-    values = config.load_task_file(task_file) if task_file else {}
-    values.update(config.parse_override(text) for text in overrides)
-    settings = config.from_flat(values)
+    """The run's settings with the `name:=value` overrides put in, checked as a whole. Raises SettingsError."""
+    values = read_values(task_file, overrides)
+    settings = config.from_flat({name: value for name, value in values.items() if name in SETTINGS})
     world_spec(settings.task)
     return settings
+
+
+def read_values(task_file: Path | None, overrides: Iterable[str]) -> dict[str, Any]:
+    """What the task file and the `name:=value` overrides say, of the run and of its robots, by name. Raises SettingsError."""
+    values = config.load_task_file(task_file) if task_file else {}
+    values.update(config.parse_override(text) for text in overrides)
+    known = {**SETTINGS, **ROBOT_SETTINGS}
+    for name in values:
+        if name not in known:
+            raise config.unknown_setting(name, known)
+    return {name: known[name].check(value) for name, value in values.items()}
 
 
 def node_environment() -> dict[str, str]:
