@@ -63,7 +63,8 @@ def _messages(store, request: RolloutRequest, trajectory: Trajectory) -> Iterato
         yield 'joint_state', 'JointState', {
             'stamp': stamp, 'num_worlds': W, 'num_agents': N, 'observation_size': O, 'state_size': S,
             'episode_start': trajectory.episode_start[step].astype(np.uint8), 'observations': observations[step].ravel(),
-            'state': trajectory.states[step].ravel()}
+            'state': trajectory.states[step].ravel(), 'num_actions': A,
+            'available': _flags(trajectory.available, step), 'present': _flags(trajectory.present, step)}
         if step == T:
             return
         for robot in range(N):
@@ -74,4 +75,10 @@ def _messages(store, request: RolloutRequest, trajectory: Trajectory) -> Iterato
         yield 'shared_reward', 'SharedReward', {
             'stamp': stamp, 'num_worlds': W, 'state_size': S, 'reward': trajectory.rewards[step],
             'terminated': trajectory.terminated[step].astype(np.uint8),
-            'truncated': trajectory.truncated[step].astype(np.uint8), 'final_states': finals[step].ravel()}
+            'truncated': trajectory.truncated[step].astype(np.uint8), 'final_states': finals[step].ravel(),
+            'won': _flags(trajectory.won, step)}
+
+
+def _flags(of_steps: np.ndarray | None, step: int) -> np.ndarray:
+    """The field of flags of a step; empty where they say nothing, and for what is seen after the last action."""
+    return np.empty(0, np.uint8) if of_steps is None or step == len(of_steps) else of_steps[step].astype(np.uint8).ravel()

@@ -59,7 +59,8 @@ def _group(settings: Settings, group: int, run: dict[str, int], key: dict[str, s
     """World and agents of one group, numbered where there are several."""
     task = settings.task
     mark = f'_{group}' if task.world_groups > 1 else ''
-    together = settings.run.robots_per_process or task.num_agents
+    # With SROS 2 a process has one enclave, and every robot's names its own topics alone.
+    together = 1 if _secured() else settings.run.robots_per_process or task.num_agents
     teams = [range(first, min(first + together, task.num_agents)) for first in range(0, task.num_agents, together)]
     return [NodeProcess('world', f'world{mark}', {'group': group, **run}),
             *(_agents(robots, group, task.world_groups, mark, {**run, **key}) for robots in teams)]
@@ -76,9 +77,13 @@ def _agents(robots: range, group: int, world_groups: int, mark: str, given: dict
 
 def enclave_arguments(name: str, namespace: str) -> list[str]:
     """With SROS 2 switched on, what tells a node its enclave, which has the node's name."""
-    if os.environ.get('ROS_SECURITY_ENABLE') != 'true':
+    if not _secured():
         return []
     return ['--enclave', f'{"/" + namespace.strip("/") if namespace else ""}/{name}']
+
+
+def _secured() -> bool:
+    return os.environ.get('ROS_SECURITY_ENABLE') == 'true'
 
 
 def find_task_file(name: str) -> Path:

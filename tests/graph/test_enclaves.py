@@ -12,9 +12,11 @@ from ament_index_python.packages import get_package_prefix
 from dae_ros_msgs.srv import GetPolicy
 from harness import REPOSITORY, SMALL, Listener, bringup, finish, oracle
 
+from dae_ros import config
 from dae_ros.report.summary import Summary
 from dae_ros.ros import enclaves, names
-from dae_ros.ros.graph import enclave_arguments
+from dae_ros.ros.graph import enclave_arguments, training_graph
+from dae_ros.run_folder import RunFolder
 
 SHIPPED = REPOSITORY / 'config' / 'sros2' / 'team.policy.xml'
 
@@ -64,6 +66,14 @@ def test_nodes_are_told_their_enclaves_where_security_is_switched_on(monkeypatch
     monkeypatch.setenv('ROS_SECURITY_ENABLE', 'true')
     assert enclave_arguments('agent_0', '/red') == ['--enclave', '/red/agent_0']
     assert enclave_arguments('agent_0', '') == ['--enclave', '/agent_0']
+
+
+def test_every_robot_has_a_process_and_so_an_enclave_of_its_own_where_security_is_switched_on(monkeypatch, tmp_path):
+    settings = config.from_flat(SMALL)
+    folder = RunFolder(tmp_path, settings)
+    assert 'agents_0-2' in {process.name for process in training_graph(settings, folder)}
+    monkeypatch.setenv('ROS_SECURITY_ENABLE', 'true')
+    assert {'agent_0', 'agent_1', 'agent_2'} <= {process.name for process in training_graph(settings, folder)}
 
 
 @pytest.mark.skipif(not shutil.which('ros2') or not has_security(),
