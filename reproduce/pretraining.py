@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
+import json
 import shutil
 from pathlib import Path
 from typing import Callable, Iterator
@@ -33,7 +35,10 @@ def pretrained_file(runs: Path, settings: Settings, steps: int, check: Callable[
     """
     settings = config.from_flat(OF_THE_RUN_ALONE, settings)
     task = settings.task
-    folder = runs / FOLDER / f'{task.task}_n{task.num_agents}_seed{settings.run.seed}_{steps}_{config.digest(settings)[:12]}'
+    # A setting that is declared later, and has its default here, does not make it another one.
+    changed = {name: value for name, value in config.flatten(settings).items() if value != config.SETTINGS[name].default}
+    digest = hashlib.sha256(json.dumps(changed, sort_keys=True).encode()).hexdigest()[:12]
+    folder = runs / FOLDER / f'{task.task}_n{task.num_agents}_seed{settings.run.seed}_{steps}_{digest}'
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / 'reward.safetensors'
     with open(folder / 'lock', 'w') as lock:  # runs that share it wait for the first

@@ -57,14 +57,19 @@ def _messages(store, request: RolloutRequest, trajectory: Trajectory) -> Iterato
     finals = np.split(trajectory.final_states, np.cumsum(trajectory.truncated.sum(1))[:-1])
     # Nobody acts on what is seen after the last action, and a trajectory leaves it out.
     observations = np.concatenate([trajectory.observations, trajectory.observations[-1:]])
+
+    def flags(values: np.ndarray | None, step: int) -> np.ndarray:
+        """An optional field; of what comes after the last action nothing is known."""
+        return np.empty(0, np.uint8) if values is None or step == T else values[step].astype(np.uint8).ravel()
+
     yield 'rollout_request', 'RolloutRequest', request._asdict()
     for step in range(T + 1):
         stamp = store.types['dae_ros_msgs/msg/Stamp'](request.run, request.rollout, request.attempt, step)
         yield 'joint_state', 'JointState', {
             'stamp': stamp, 'num_worlds': W, 'num_agents': N, 'observation_size': O, 'state_size': S,
-            'episode_start': trajectory.episode_start[step].astype(np.uint8), 'observations': observations[step].ravel(),
-            'state': trajectory.states[step].ravel(), 'num_actions': A,
-            'available': _flags(trajectory.available, step), 'present': _flags(trajectory.present, step)}
+            'num_actions': 0 if trajectory.available is None else A, 'observations': observations[step].ravel(),
+            'episode_start': trajectory.episode_start[step].astype(np.uint8), 'state': trajectory.states[step].ravel(),
+            'available': flags(trajectory.available, step), 'present': flags(trajectory.present, step)}
         if step == T:
             return
         for robot in range(N):
@@ -76,9 +81,4 @@ def _messages(store, request: RolloutRequest, trajectory: Trajectory) -> Iterato
             'stamp': stamp, 'num_worlds': W, 'state_size': S, 'reward': trajectory.rewards[step],
             'terminated': trajectory.terminated[step].astype(np.uint8),
             'truncated': trajectory.truncated[step].astype(np.uint8), 'final_states': finals[step].ravel(),
-            'won': _flags(trajectory.won, step)}
-
-
-def _flags(of_steps: np.ndarray | None, step: int) -> np.ndarray:
-    """The field of flags of a step; empty where they say nothing, and for what is seen after the last action."""
-    return np.empty(0, np.uint8) if of_steps is None or step == len(of_steps) else of_steps[step].astype(np.uint8).ravel()
+            'won': flags(trajectory.won, step)}
