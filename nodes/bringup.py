@@ -139,9 +139,11 @@ def bring_up(arguments: argparse.Namespace) -> int:
 
 
 def main(args: list[str] | None = None) -> int:
-    interrupt_once()
-    arguments = parse_arguments(args)
-    return run_command(lambda: bring_up(arguments), 'stopped; every process is down')
+    def act() -> int:
+        interrupt_once()
+        return bring_up(parse_arguments(args))
+
+    return run_command(act, 'stopped; every process is down')
 
 
 if __name__ == '__main__':

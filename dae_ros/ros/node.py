@@ -186,9 +186,9 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
             raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, interrupt)  # rclpy's handler, which shuts the context down, calls this one
-    rclpy.init(args=args)
     try:
         try:
+            rclpy.init(args=args)
             nodes += make_nodes()
             executor = Executor()
             for node in nodes:

@@ -25,6 +25,15 @@ def _end_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
+def catches(pid: int, number: int) -> bool:
+    """Whether a process handles a signal itself; False where it is gone."""
+    try:
+        status = dict(line.split(':', 1) for line in Path(f'/proc/{pid}/status').read_text().splitlines())
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return bool(int(status.get('SigCgt', '0'), 16) >> number - 1 & 1)
+
+
 class Supervisor:
     """A group of processes with a log file each.
 
@@ -72,7 +81,9 @@ class Supervisor:
     def stop(self) -> None:
         """Asks every process to end and kills what has not within `GRACE` seconds, or when it is interrupted again."""
         try:
-            self._signal(signal.SIGINT)
+            for process in self._alive():
+                # Until it has come so far as to handle signals itself, Ctrl-C would have it show where in its imports it was.
+                os.killpg(process.pid, signal.SIGINT if catches(process.pid, signal.SIGTERM) else signal.SIGTERM)
             deadline = time.monotonic() + GRACE
             for process in self._processes.values():
                 while process.poll() is None and time.monotonic() < deadline and not hurried():
@@ -80,14 +91,13 @@ class Supervisor:
                         process.wait(GLANCE)
         except KeyboardInterrupt:
             pass
-        self._signal(signal.SIGKILL)
+        for process in self._alive():
+            os.killpg(process.pid, signal.SIGKILL)
         for process in self._processes.values():
             process.wait()
 
-    def _signal(self, number: int) -> None:
-        for process in self._processes.values():
-            if process.poll() is None:
-                os.killpg(process.pid, number)
+    def _alive(self) -> list[subprocess.Popen]:
+        return [process for process in self._processes.values() if process.poll() is None]
 
     def _watch(self, name: str, process: subprocess.Popen) -> None:
         self._on_exit(name, process.wait())

@@ -13,6 +13,7 @@ from harness import SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of, p
 
 from dae_ros.report.metrics import read_metrics
 from dae_ros.report.summary import Summary
+from dae_ros.ros.supervisor import catches
 
 LONG = {**SMALL, 'total_steps': 10**7}
 
@@ -114,16 +115,15 @@ def wait_until_gone(pid: int) -> None:
     os.close(descriptor)
 
 
-def catches_interrupts(process) -> bool:
-    """Whether a process has come so far as to handle SIGTERM itself."""
-    status = dict(line.split(':', 1) for line in (Path('/proc') / str(process.pid) / 'status').read_text().splitlines())
-    return bool(int(status['SigCgt'], 16) >> signal.SIGTERM - 1 & 1)
+def runs(executable: str, folder: Path) -> bool:
+    """Whether a process of the run that lies below `folder` runs it."""
+    return any(f'dae_ros_nodes.{executable} ' in line for line in processes_naming(str(folder)))
 
 
 MOMENTS = {
-    'as soon as it can hear': catches_interrupts,
-    'while nodes are started': lambda process: processes_naming('dae_ros_nodes.agent'),
-    'when the last node has begun': lambda process: processes_naming('__node:=trainer'),
+    'as soon as it can hear': lambda process, folder: catches(process.pid, signal.SIGTERM),
+    'while nodes are started': lambda process, folder: runs('agent', folder),
+    'when the last node has begun': lambda process, folder: runs('trainer', folder),
 }
 
 
@@ -132,7 +132,7 @@ MOMENTS = {
 def test_ctrl_c_at_any_time_stops_every_process_without_a_traceback(moment, times, domain, tmp_path):
     process = bringup(tmp_path / 'run', LONG)
     try:
-        while not MOMENTS[moment](process):
+        while not MOMENTS[moment](process, tmp_path):
             assert process.poll() is None
             time.sleep(0.005)
         for _ in range(times):

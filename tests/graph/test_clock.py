@@ -1,96 +1,36 @@
-"""A host's clock that is set back or forward in the middle of a run: nobody stops for it, and no weight changes."""
+"""Nothing waits by a clock that can be set: timers go on where a node's time stands still, and nobody else asks for the time."""
 
 from __future__ import annotations
 
-import mmap
-import shutil
-import struct
-import subprocess
+import re
 
-import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import SMALL, Listener, oracle
-from std_srvs.srv import Trigger
+from harness import REPOSITORY, TIMEOUT, Listener
+from test_parameters import start
 
 from dae_ros.ros import names, qos
 
-HOUR = 3600  # s
-SHIM = r'''
-#include <fcntl.h>
-#include <stdlib.h>
-#include <sys/mman.h>
-#include <sys/syscall.h>
-#include <sys/time.h>
-#include <time.h>
-#include <unistd.h>
-
-static volatile long *shift;  /* s, shared by all processes */
-
-__attribute__((constructor)) static void find_shift(void) {
-  int file = open(getenv("CLOCK_SHIFT"), O_RDONLY);
-  void *found = mmap(0, sizeof(long), PROT_READ, MAP_SHARED, file, 0);
-  close(file);
-  if (found != MAP_FAILED) shift = found;
-}
-
-int clock_gettime(clockid_t clock, struct timespec *now) {
-  int failed = syscall(SYS_clock_gettime, clock, now);
-  if (!failed && clock == CLOCK_REALTIME && shift) now->tv_sec += *shift;
-  return failed;
-}
-
-int gettimeofday(struct timeval *restrict now, void *restrict zone) {
-  struct timespec time;
-  clock_gettime(CLOCK_REALTIME, &time);
-  now->tv_sec = time.tv_sec;
-  now->tv_usec = time.tv_nsec / 1000;
-  return 0;
-}
-
-time_t time(time_t *now) {
-  struct timespec time;
-  clock_gettime(CLOCK_REALTIME, &time);
-  if (now) *now = time.tv_sec;
-  return time.tv_sec;
-}
-'''
+WALL_CLOCK = re.compile(r'time\.time\b|time_ns\(|datetime\.now|clock_gettime')
+MAY_ASK = {'nodes/bringup.py',          # to name a folder
+           'nodes/recorder.py',         # to name a bag, and once for the stamps in it
+           'dae_ros/ros/graph_run.py',  # for the age of files, as the next
+           'dae_ros/ros/shared_memory.py'}
 
 
-@pytest.fixture
-def set_clock(tmp_path, monkeypatch):
-    """Sets the clock of all processes started from here on, by seconds from the true time, also while they run."""
-    compiler = shutil.which('cc')
-    if compiler is None:
-        pytest.skip('there is no C compiler here')
-    source, library, file = (tmp_path / name for name in ('clock.c', 'clock.so', 'shift'))
-    source.write_text(SHIM)
-    subprocess.run([compiler, '-shared', '-fPIC', '-o', str(library), str(source)], check=True)
-    file.write_bytes(bytes(8))
-    monkeypatch.setenv('CLOCK_SHIFT', str(file))
-    monkeypatch.setenv('LD_PRELOAD', str(library))
-    with open(file, 'r+b') as opened, mmap.mmap(opened.fileno(), 8) as shift:
-        yield lambda seconds: shift.__setitem__(slice(0, 8), struct.pack('=q', seconds))
+def test_a_node_whose_clock_stands_still_goes_on_giving_signs_of_life(domain, tmp_path):
+    process = start('world', '-p', 'use_sim_time:=true', cwd=tmp_path)  # and nobody publishes the time
+    heard: list[DiagnosticArray] = []
+    try:
+        with Listener() as listener:
+            listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, heard.append, qos.EVENTS)
+            listener.spin_until(lambda: len(heard) >= 3)
+    finally:
+        process.terminate()
+        _, errors = process.communicate(timeout=TIMEOUT)
+    assert all(report.header.stamp.sec == 0 for report in heard) and 'Traceback' not in errors
 
 
-@pytest.mark.parametrize('jump', [-HOUR, HOUR], ids=['back', 'forward'])
-def test_a_clock_that_jumps_stops_nobody_and_changes_no_weight(jump, set_clock, make_graph, tmp_path):
-    graph = make_graph(tmp_path / 'graph', SMALL)
-    heard: dict[str, list[int]] = {f'/{name}': [] for name in graph.names}
-
-    def hear(report: DiagnosticArray) -> None:
-        for status in report.status:
-            heard[status.name].append(report.header.stamp.sec)
-
-    graph.start(*graph.names)
-    with Listener() as listener:
-        listener.wait_for_status(lambda status: status.policy_version >= 1)
-        listener.call(Trigger, names.PAUSE, Trigger.Request())
-        listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, hear, qos.EVENTS)
-        listener.spin_until(lambda: all(heard.values()))
-        set_clock(jump)
-        before = {name: stamps[-1] for name, stamps in heard.items()}
-        listener.spin_until(lambda: all(sum(abs(stamp - before[name] - jump) < HOUR / 2 for stamp in stamps) >= 3
-                                        for name, stamps in heard.items()), lambda: f'who is silent since? {heard}')
-        listener.call(Trigger, names.RESUME, Trigger.Request())
-    assert graph.wait() == 0, graph.log('trainer')
-    assert graph.result() == oracle(tmp_path / 'alone', SMALL)
+def test_nobody_asks_a_clock_that_can_be_set_but_for_names_and_ages_of_files_and_recorded_stamps():
+    sources = [path for folder in ('dae_ros', 'nodes') for path in (REPOSITORY / folder).rglob('*.py')]
+    asking = {path.relative_to(REPOSITORY).as_posix() for path in sources if WALL_CLOCK.search(path.read_text())}
+    assert asking <= MAY_ASK
