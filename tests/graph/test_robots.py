@@ -27,7 +27,7 @@ from dae_ros.weights.codec import decode_policy
 
 LAYOUTS, NEEDED = 20, 16
 SECONDS = 8.0   # of simulated time for each layout
-SPEEDUP = 5.0
+SPEEDUP = 3.0
 CLOSE = 0.25    # m, mean distance of the landmarks to the nearest robot
 SIMULATED = {'use_sim_time': 'true'}
 
@@ -139,7 +139,7 @@ def test_what_robots_do_does_not_change_when_trainer_and_parameter_server_are_ki
     assert stage.call(Trigger, 'agent_0/activate_policy', Trigger.Request()).message == 'acting with policy version 0'
 
 
-@pytest.mark.slow  # twenty layouts of eight seconds each, at five times real time
+@pytest.mark.slow  # twenty layouts of eight seconds each, at three times real time
 def test_the_navigation_team_covers_the_landmarks_with_foreign_differential_robots(stage, processes):
     """Robots that were never seen, at 10 Hz, with 5 % noise and 50 ms delay; only their clock runs faster than ours."""
     processes.python('robots', 'examples.foreign_robots', '--ros-args', '-p', f'speedup:={SPEEDUP}')
