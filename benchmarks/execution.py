@@ -32,7 +32,7 @@ def measure() -> dict[str, float]:
     from dae_ros.types import Observation, Stamp
 
     os.environ.update(node_environment())
-    agent = subprocess.Popen([sys.executable, '-m', 'dae_ros_nodes.robot_agent', '--ros-args', '-p', f'policy_file:={POLICY}'])
+    agent = subprocess.Popen([sys.executable, '-m', 'dae_ros_nodes.agent', '--ros-args', '-p', f'policy_file:={POLICY}'])
     rclpy.init(args=[])
     node = rclpy.create_node('benchmark')
     executor = SingleThreadedExecutor()

@@ -186,7 +186,8 @@ class AgentSettings:
 class ExecutionSettings:
     """How a robot's agent acts once the team is trained."""
 
-    policy_file: str = setting('', 'safetensors file with the policy to act with; empty takes what the parameter server has')
+    execute: bool = setting(False, 'act as a trained team does: on whatever is observed, with no trainer and no world')
+    policy_file: str = setting('', 'safetensors file with the policy to execute; empty takes what the parameter server has')
     greedy: bool = setting(True, 'take the most probable action instead of drawing one')
 
 
@@ -215,8 +216,9 @@ class BodySettings:
 class RobotWorldSettings:
     """How our own simulator plays the robots."""
 
-    real_time_factor: float = setting(1.0, 'seconds simulated per second; other than 1 it publishes /clock, and all others need '
-                                           'use_sim_time', minimum=0.01, maximum=1000.0)
+    real_time_factor: float = setting(0.0, 'play the robots of one team, so many times as fast as real ones; other than 1 the '
+                                           'world publishes /clock, and all others need use_sim_time. 0 simulates in lockstep',
+                                      minimum=0.0, maximum=1000.0)
     odometry_rate: float = setting(20.0, 'odometry per simulated second', unit='Hz', minimum=1.0, maximum=1000.0)
     reset_episodes: bool = setting(False, 'put robots and landmarks elsewhere whenever an episode begins')
 

@@ -2,6 +2,7 @@
 
     ros2 run dae_ros agent --ros-args -p robot:=0 -r __node:=agent_0
     ros2 run dae_ros agent --ros-args -p robots:=3
+    ros2 run dae_ros agent --ros-args -p robot:=0 -p policy_file:=policy.safetensors
 """
 
 from __future__ import annotations
@@ -11,7 +12,16 @@ import sys
 from dae_ros_msgs import msg, srv
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from dae_ros.config import SETTINGS, AgentSettings, GroupBinding, RunBinding, TeamKey, check_group, declarations
+from dae_ros.config import (
+    SETTINGS,
+    AgentSettings,
+    ExecutionSettings,
+    GroupBinding,
+    RunBinding,
+    TeamKey,
+    check_group,
+    declarations,
+)
 from dae_ros.errors import Refused, SettingsError
 from dae_ros.rollout.lockstep import AgentEnd, check_run
 from dae_ros.ros import convert, names, qos
@@ -121,13 +131,18 @@ def processes(endpoints: list[TopicEndpointInfo]) -> set[bytes]:
     return {bytes(endpoint.endpoint_gid[:GUID_PREFIX]) for endpoint in endpoints}
 
 
-def make_agents() -> list[AgentNode]:
-    """The agents that the command line asks for. Raises SettingsError."""
-    with settings_of_process('agent', DECLARED) as asked:
+def make_agents() -> list[TeamNode]:
+    """The agents that the command line asks for: for a training, or of a trained team. Raises SettingsError."""
+    with settings_of_process('agent', [*DECLARED, *declarations(ExecutionSettings), SETTINGS['seed']]) as asked:
         first, count, group, world_groups = (asked[name] for name in ('robot', 'robots', 'group', 'world_groups'))
+        make = AgentNode
+        if asked['execute'] or asked['policy_file']:
+            from dae_ros_nodes.robot_agent import RobotAgentNode
+
+            make = RobotAgentNode
         if count == 1:
-            return [AgentNode()]
-        agents = [AgentNode(names.agent_node(robot, group, world_groups), robot=robot, robots=1)
+            return [make()]
+        agents = [make(names.agent_node(robot, group, world_groups), robot=robot, robots=1)
                   for robot in range(first, first + count)]
     if len({agent.get_name() for agent in agents}) < count:
         raise SettingsError(f'the agents of {count} robots cannot all be named {agents[0].get_name()}; leave __node to each')

@@ -79,7 +79,8 @@ def train_on_robots(settings: Settings, folder: RunFolder, arguments: argparse.N
     from dae_ros.ros.graph import read_values
     from dae_ros.ros.graph_run import GraphRun
 
-    processes = streaming_graph(settings, read_values(task_file_of(arguments), arguments.parameter), folder, arguments.simulate)
+    values = read_values(task_file_of(arguments), arguments.parameter)
+    processes = streaming_graph(settings, values, folder, arguments.simulate, arguments.key_file)
     GraphRun(settings, folder, arguments.namespace, display, processes).run()
 
 
@@ -97,7 +98,7 @@ def execute(arguments: argparse.Namespace) -> None:
 
     values = read_values(task_file_of(arguments), arguments.parameter)
     folder = arguments.run_folder or Path('runs') / f'execution-{datetime.now():%Y%m%d-%H%M%S}'
-    processes = execution_graph(values, find_policy(arguments.execute), arguments.simulate)
+    processes = execution_graph(values, find_policy(arguments.execute), arguments.simulate, arguments.key_file)
     print(f'driving; Ctrl-C stops the robots (logs of the nodes in {folder / "logs"})', flush=True)
     settings_file = write_values(values, folder / 'settings.yaml')
     ExecutionRun(processes, settings_file, arguments.namespace, lambda line: print(line, flush=True)).run()

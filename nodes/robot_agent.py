@@ -1,11 +1,10 @@
-"""robot_agent: acts for one robot with a trained policy, from a file or the parameter server; nobody else is needed.
+"""The agent of a trained team's robot: acts with a policy from a file or the parameter server; nobody else is needed.
 
-    ros2 run dae_ros robot_agent --ros-args -p robot:=0 -p policy_file:=policy.safetensors
+    ros2 run dae_ros agent --ros-args -p robot:=0 -p policy_file:=policy.safetensors
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import deque
 from pathlib import Path
@@ -14,13 +13,15 @@ import numpy as np
 from dae_ros_msgs import msg
 from std_srvs.srv import Trigger
 
-from dae_ros.config import SETTINGS, AgentSettings, ExecutionSettings, RunBinding, declarations
+from dae_ros.config import SETTINGS, AgentSettings, ExecutionSettings, RunBinding, TeamKey, declarations
 from dae_ros.errors import Refused, SettingsError
 from dae_ros.robots.acting import ActingEnd
 from dae_ros.ros import convert, names, qos
-from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.node import TeamNode
+from dae_ros.ros.trust import team_key
 from dae_ros.weights.codec import decode_policy, open_weights
 
+DECLARED = [*declarations(AgentSettings, ExecutionSettings, RunBinding, TeamKey), SETTINGS['seed']]
 FROM_FILE = 1, 0  # run and version of a policy whose file says neither
 REMEMBERED = 1000  # answers whose times are shown
 
@@ -28,8 +29,8 @@ REMEMBERED = 1000  # answers whose times are shown
 class RobotAgentNode(TeamNode):
     """Wires an `ActingEnd` to its robot's topics."""
 
-    def __init__(self):
-        super().__init__('robot_agent', [*declarations(AgentSettings, ExecutionSettings, RunBinding), SETTINGS['seed']])
+    def __init__(self, name: str = 'agent', **given: int):
+        super().__init__(name, DECLARED, **given)
         robot, path = self.settings['robot'], self.settings['policy_file']
         self._end = ActingEnd(robot, self.settings['greedy'], self.settings['seed'], self.settings['run'])
         self._taken: deque[float] = deque(maxlen=REMEMBERED)
@@ -38,6 +39,7 @@ class RobotAgentNode(TeamNode):
             self._end.run = FROM_FILE[0]
             self._end.on_policy(*FROM_FILE, read_policy(Path(path)))
         else:
+            self._key = team_key(self, self.settings['key_file'])
             self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED_INPUT, self._on_policy)
         self.create_service(Trigger, names.ACTIVATE_POLICY, self._on_activate)
         self.listen(msg.Observation, names.OBSERVATION.format(robot), qos.LATCHED_INPUT, self._on_observation)
@@ -51,7 +53,7 @@ class RobotAgentNode(TeamNode):
 
     def _on_policy(self, message: msg.PolicyWeights) -> None:
         weights = convert.policy_weights(message)
-        self._end.on_policy(weights.run, weights.version, open_weights(weights))
+        self._end.on_policy(weights.run, weights.version, open_weights(weights, self._key))
 
     def _on_activate(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         version = self._end.activate()
@@ -78,11 +80,3 @@ def read_policy(path: Path):
         raise SettingsError(f'cannot read policy_file {path}: {error.strerror}') from error
     except Refused as refusal:
         raise SettingsError(f'policy_file {path} is no policy: {refusal.detail}') from refusal
-
-
-def main(args: list[str] | None = None) -> int:
-    return run(RobotAgentNode, args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,11 +1,10 @@
-"""robot_world: our simulator as the robots of one team: odometry, tf, landmarks and markers out, cmd_vel in.
+"""Our simulator as the robots of one team: odometry, tf, landmarks and markers out, cmd_vel in.
 
-    ros2 run dae_ros robot_world --ros-args -p task:=navigation -p num_agents:=3
+    ros2 run dae_ros world --ros-args -p task:=navigation -p num_agents:=3 -p real_time_factor:=1.0
 """
 
 from __future__ import annotations
 
-import sys
 from functools import partial
 
 from geometry_msgs.msg import PoseArray, TransformStamped, Twist, TwistStamped
@@ -22,7 +21,7 @@ from dae_ros.robots.pilot import stamp_at
 from dae_ros.robots.setup import limits_in, task_frame, task_settings
 from dae_ros.ros import convert_robots, names, qos
 from dae_ros.ros.markers import markers
-from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.node import TeamNode
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -37,7 +36,7 @@ class RobotWorldNode(TeamNode):
     """Wires `Bodies` to the topics of robots. At real time it goes by the system's clock, else it is the clock."""
 
     def __init__(self):
-        super().__init__('robot_world', [*declarations(TaskSettings, BodySettings, RobotWorldSettings), SETTINGS['seed']])
+        super().__init__('world', [*declarations(TaskSettings, BodySettings, RobotWorldSettings), SETTINGS['seed']])
         settings, task = self.settings, task_settings(self.settings)
         self._frame, self._world_frame, robots = task_frame(settings), settings['world_frame'], range(task.num_agents)
         self._bodies = Bodies(task, self._frame, limits_in(settings), settings['drive'] == 'differential', settings['seed'])
@@ -105,11 +104,3 @@ class RobotWorldNode(TeamNode):
 
     def diagnose(self):
         return 'simulating', {'episode': self._episode, 'tf': 'published' if self._transforms else 'not published: no tf2_msgs'}
-
-
-def main(args: list[str] | None = None) -> int:
-    return run(RobotWorldNode, args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,6 +1,7 @@
-"""world: simulates the team's worlds, or one group of them, in lockstep with its agents.
+"""world: simulates the team's worlds, or one group of them, in lockstep with its agents; or plays robots in real time.
 
     ros2 run dae_ros world --ros-args -p task:=navigation -p num_agents:=3 -p num_worlds:=128
+    ros2 run dae_ros world --ros-args -p task:=navigation -p num_agents:=3 -p real_time_factor:=1.0
 """
 
 from __future__ import annotations
@@ -9,10 +10,20 @@ import sys
 
 from dae_ros_msgs import msg
 
-from dae_ros.config import GroupBinding, RunBinding, TaskSettings, check_group, declarations, from_flat
+from dae_ros.config import (
+    SETTINGS,
+    BodySettings,
+    GroupBinding,
+    RobotWorldSettings,
+    RunBinding,
+    TaskSettings,
+    check_group,
+    declarations,
+    from_flat,
+)
 from dae_ros.rollout.lockstep import WorldEnd, check_request
 from dae_ros.ros import convert, names, qos
-from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.node import TeamNode, run, settings_of_process
 from dae_ros.types import JointState, Observation, RolloutRequest
 from dae_ros.worlds import make_worlds
 
@@ -98,8 +109,19 @@ class WorldNode(TeamNode):
         self._worlds.close()
 
 
+def make_world() -> TeamNode:
+    """The world that the command line asks for: in lockstep, or our robots. Raises SettingsError."""
+    declared = declarations(TaskSettings, GroupBinding, RunBinding, BodySettings, RobotWorldSettings)
+    with settings_of_process('world', [*declared, SETTINGS['seed']]) as asked:
+        if not asked['real_time_factor']:
+            return WorldNode()
+        from dae_ros_nodes.robot_world import RobotWorldNode
+
+        return RobotWorldNode()
+
+
 def main(args: list[str] | None = None) -> int:
-    return run(WorldNode, args)
+    return run(make_world, args)
 
 
 if __name__ == '__main__':

@@ -10,7 +10,7 @@ import yaml
 from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
 from dae_ros.errors import SettingsError
 from dae_ros.robots.setup import task_settings
-from dae_ros.ros.graph import NodeProcess, shipped_config, training_graph
+from dae_ros.ros.graph import NodeProcess, key_parameters, shipped_config, training_graph
 from dae_ros.run_folder import RunFolder
 
 NEEDED = {'seed', *(name for name, info in SETTINGS.items() if info.group == 'task'), *ROBOT_SETTINGS}
@@ -27,32 +27,38 @@ def find_policy(name: str) -> str:
     raise SettingsError(f'there is no policy file {name}')
 
 
-def execution_graph(values: dict[str, Any], policy_file: str, simulate: bool) -> list[NodeProcess]:
+def execution_graph(values: dict[str, Any], policy_file: str, simulate: bool, key_file: str = '') -> list[NodeProcess]:
     """An agent and a bridge for each robot; with `simulate` also the robots, which may then move from the start."""
     robots = range(task_settings(values).num_agents)
     own_clock = clock_parameters(values, simulate)
-    policy = {'policy_file': policy_file} if policy_file else {}
+    agent = {'execute': True, **({'policy_file': policy_file} if policy_file else key_parameters(key_file)), **own_clock}
     bridge = {'enabled': values.get('enabled', simulate), **own_clock}
-    return [*([NodeProcess('robot_world', 'robot_world', {})] if simulate else []),
-            *(NodeProcess('robot_agent', f'agent_{robot}', {'robot': robot, **policy, **own_clock}) for robot in robots),
+    return [*([NodeProcess('world', 'world', {'real_time_factor': real_time_factor(values)})] if simulate else []),
+            *(NodeProcess('agent', f'agent_{robot}', {'robot': robot, **agent}) for robot in robots),
             *(NodeProcess('robot_bridge', f'bridge_{robot}', {'robot': robot, **bridge}) for robot in robots)]
 
 
-def streaming_graph(settings: Settings, values: dict[str, Any], folder: RunFolder, simulate: bool) -> list[NodeProcess]:
+def streaming_graph(settings: Settings, values: dict[str, Any], folder: RunFolder, simulate: bool,
+                    key_file: str = '') -> list[NodeProcess]:
     """The same with who learns from it: parameter server, trainer and task monitor. Agents draw their actions."""
-    server, trainer = training_graph(settings, folder)[-2:]
+    server, trainer = training_graph(settings, folder, key_file)[-2:]
     monitor = NodeProcess('task_monitor', 'task_monitor', clock_parameters(values, simulate))
-    more = {'robot_world': {}, 'robot_agent': {'run': folder.run, 'greedy': False}, 'robot_bridge': {'run': folder.run},
+    more = {'world': {}, 'agent': {'run': folder.run, 'greedy': False}, 'robot_bridge': {'run': folder.run},
             'task_monitor': {'run': folder.run}}
     robots = {name: value for name, value in values.items() if name in ROBOT_SETTINGS}  # not in the run's settings file
     return [server, trainer._replace(executable='stream_trainer', parameters={**trainer.parameters, **robots}),
             *(process._replace(parameters={**robots, **process.parameters, **more[process.executable]})
-              for process in (monitor, *execution_graph(values, '', simulate)))]
+              for process in (monitor, *execution_graph(values, '', simulate, key_file)))]
 
 
 def clock_parameters(values: dict[str, Any], simulate: bool) -> dict[str, Any]:
     """What nodes need to go by the simulator's clock, where that is not the system's."""
-    return {'use_sim_time': True} if simulate and values.get('real_time_factor', 1.0) != 1.0 else {}
+    return {'use_sim_time': True} if simulate and real_time_factor(values) != 1.0 else {}
+
+
+def real_time_factor(values: dict[str, Any]) -> float:
+    """How many times as fast as real robots our simulator plays them."""
+    return values.get('real_time_factor') or 1.0
 
 
 def write_values(values: dict[str, Any], path: Path) -> Path:

@@ -45,7 +45,7 @@ class NodeProcess(NamedTuple):
 def training_graph(settings: Settings, folder: RunFolder, key_file: str = '') -> list[NodeProcess]:
     """Parameter server, trainer and, for each group, a world and its robots' agents: the processes of one run."""
     run = {'run': folder.run}
-    key = {'key_file': str(Path(key_file).absolute())} if key_file else {}
+    key = key_parameters(key_file)
     return [
         *(process for group in range(settings.task.world_groups) for process in _group(settings, group, run, key)),
         NodeProcess('parameter_server', 'parameter_server',
@@ -53,6 +53,11 @@ def training_graph(settings: Settings, folder: RunFolder, key_file: str = '') ->
                      **key}),
         NodeProcess('trainer', 'trainer', {'run_folder': str(folder.path), **key}),
     ]
+
+
+def key_parameters(key_file: str) -> dict[str, str]:
+    """What those who sign policies or take them are told."""
+    return {'key_file': str(Path(key_file).absolute())} if key_file else {}
 
 
 def _group(settings: Settings, group: int, run: dict[str, int], key: dict[str, str]) -> list[NodeProcess]:

@@ -11,7 +11,7 @@ from harness import TIMEOUT, Listener
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 
-NODES = ('world', 'agent', 'parameter_server', 'trainer', 'robot_agent', 'robot_bridge')
+NODES = ('world', 'agent', 'parameter_server', 'trainer', 'robot_bridge')
 
 
 def start(node: str, *arguments: str, cwd=None) -> subprocess.Popen:
@@ -44,8 +44,8 @@ def test_an_unknown_key_in_a_parameter_file_is_an_error_too(domain, tmp_path):
     ('world', 'num_agents:=0', 'num_agents must lie in 1 .. 1000, not 0'),
     ('world', 'beta:=true', 'beta must be a number, not True'),
     ('agent', 'robot:=first', "robot must be an integer, not 'first'"),
-    ('robot_agent', 'policy_file:=nowhere.safetensors', 'cannot read policy_file nowhere.safetensors: No such file'),
-    ('robot_agent', 'policy_file:=README.md', 'policy_file README.md is no policy'),
+    ('agent', 'policy_file:=nowhere.safetensors', 'cannot read policy_file nowhere.safetensors: No such file'),
+    ('agent', 'policy_file:=README.md', 'policy_file README.md is no policy'),
     ('robot_bridge', 'landmarks:="1 2, 3 4"', 'landmarks: 2 landmarks, the task has 3'),
     ('world', 'task:=soccer', "unknown task 'soccer'"),
     ('world', 'group:=1', 'group must lie in 0 .. 0 where world_groups is 1, not 1'),
@@ -101,7 +101,7 @@ def test_every_node_starts_alone_with_its_defaults_in_any_namespace_and_ends_on_
     process = start(node, '-r', '__ns:=/somewhere/deep', cwd=tmp_path)
     try:
         with Listener() as listener:
-            parameter = {'agent': 'robot', 'parameter_server': 'keep_policies', 'robot_agent': 'robot'}.get(node, 'num_agents')
+            parameter = {'agent': 'robot', 'parameter_server': 'keep_policies'}.get(node, 'num_agents')
             response = listener.call(GetParameters, f'/somewhere/deep/{node}/get_parameters',
                                      GetParameters.Request(names=[parameter]))
             assert response.values[0].type == 2

@@ -27,7 +27,7 @@ from dae_ros.weights.codec import decode_policy
 
 LAYOUTS, NEEDED = 20, 16
 SECONDS = 8.0   # of simulated time for each layout
-SPEEDUP = 5.0
+SPEEDUP = 3.0
 CLOSE = 0.25    # m, mean distance of the landmarks to the nearest robot
 SIMULATED = {'use_sim_time': 'true'}
 
@@ -47,7 +47,7 @@ def stage(domain):
 
 def start_robot(processes, robot, agent=None, **bridge):
     agent = {'policy_file': POLICY} if agent is None else agent
-    processes.node('robot_agent', f'agent_{robot}', robot=robot, **agent, **SIMULATED)
+    processes.node('agent', f'agent_{robot}', robot=robot, **agent, **SIMULATED)
     processes.node('robot_bridge', f'bridge_{robot}', robot=robot, **{'enabled': 'true', **SIMULATED, **bridge})
 
 
@@ -107,7 +107,7 @@ def test_odometry_that_cannot_be_right_stops_the_robot_and_so_do_a_dead_agent_an
         processes.end('agent_1', signal.SIGKILL)
         stage.wait_for_words('bridge_1', 'the agent has not answered', 0, 1, 2)
         assert is_standing(stage.commands[1][-1])
-        processes.node('robot_agent', 'agent_1_again', robot=1, policy_file=POLICY)
+        processes.node('agent', 'agent_1_again', robot=1, policy_file=POLICY)
         stage.start_driving(1, 0, 1, 2)
         assert processes.end('bridge_1') == 0
         stage.spin_until(lambda: is_standing(stage.commands[1][-1]))
@@ -119,7 +119,7 @@ def test_what_robots_do_does_not_change_when_trainer_and_parameter_server_are_ki
     graph = make_graph(tmp_path / 'graph', SMALL)
     graph.start('trainer', 'parameter_server')
     for robot in range(3):
-        start_robot(processes, robot, agent={'run': graph.folder.run}, drive='holonomic')
+        start_robot(processes, robot, agent={'run': graph.folder.run, 'execute': 'true'}, drive='holonomic')
     stage.wait_for_bridges(3)
     everybody = 0, 1, 2
     for robot in everybody:
@@ -139,7 +139,7 @@ def test_what_robots_do_does_not_change_when_trainer_and_parameter_server_are_ki
     assert stage.call(Trigger, 'agent_0/activate_policy', Trigger.Request()).message == 'acting with policy version 0'
 
 
-@pytest.mark.slow  # twenty layouts of eight seconds each, at five times real time
+@pytest.mark.slow  # twenty layouts of eight seconds each, at three times real time
 def test_the_navigation_team_covers_the_landmarks_with_foreign_differential_robots(stage, processes):
     """Robots that were never seen, at 10 Hz, with 5 % noise and 50 ms delay; only their clock runs faster than ours."""
     processes.python('robots', 'examples.foreign_robots', '--ros-args', '-p', f'speedup:={SPEEDUP}')
@@ -166,7 +166,7 @@ def test_the_navigation_team_covers_the_landmarks_with_foreign_differential_robo
 def test_our_simulator_plays_robots_that_the_same_bridges_drive(domain, stage, processes):
     """Topic by topic what a real robot has: odometry, landmarks, markers, and a clock since it runs faster."""
     body = {'drive': 'holonomic', 'max_speed': 2.0, 'max_acceleration': 5.0}
-    processes.node('robot_world', 'robots', real_time_factor=4.0, **body)
+    processes.node('world', 'robots', real_time_factor=4.0, **body)
     for robot in range(3):
         start_robot(processes, robot, **body, odometry_timeout=0.6, action_timeout=1.0)
     shown, odometry, landmarks = [], {}, []
