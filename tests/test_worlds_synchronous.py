@@ -20,14 +20,19 @@ def random_actions(worlds):
     return np.random.default_rng(0).integers(worlds.spec.num_actions, size=shape)
 
 
+def there(joint):
+    """What is shown, without flags that these tasks do not have."""
+    return [part for part in joint if part is not None]
+
+
 def rollout(worlds, seed=1):
     """Rewards [T, W] and everything else that the worlds showed."""
-    shown = list(worlds.reset(seed, rollout=0))
+    shown = [*there(worlds.reset(seed, rollout=0))]
     rewards = []
     for actions in random_actions(worlds):
-        reward, *flags, joint = worlds.step(actions)
-        rewards.append(reward)
-        shown += [*flags, *joint]
+        transition = worlds.step(actions)
+        rewards.append(transition.reward)
+        shown += [transition.terminated, transition.truncated, transition.final_states, *there(transition.next)]
     return np.array(rewards), shown
 
 
