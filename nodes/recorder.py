@@ -30,7 +30,7 @@ class RecorderNode(TeamNode):
         path = Path(settings['bag'] or f'bags/{datetime.now():%Y%m%d-%H%M%S}')
         self._gaps = Gaps()
         self._missed: Counter[str] = Counter()
-        self._clock = time.time_ns() - time.monotonic_ns()  # what is set later neither stops it nor changes the order
+        self._epoch = time.time_ns() - time.monotonic_ns()  # what is set later neither stops it nor changes the order
         self._recording = Recording(path, [as_written(*topic) for topic in zip(topics, full_names)], settings['storage'],
                                     settings['compression'], settings['split_megabytes'] * 10**6,
                                     settings['split_seconds'] * 10**9)
@@ -50,7 +50,7 @@ class RecorderNode(TeamNode):
 
     def _now(self) -> int:
         """The host's clock as it was set when the recorder began [ns]."""
-        return self._clock + time.monotonic_ns()
+        return self._epoch + time.monotonic_ns()
 
     def diagnose(self):
         silent = [name for name, subscription in self._subscriptions_by_name.items() if not subscription.get_publisher_count()]
