@@ -8,10 +8,11 @@ from collections.abc import Callable
 from dae_ros.config import TaskSettings
 from dae_ros.errors import SettingsError
 from dae_ros.types import WorldSpec
-from dae_ros.worlds import pettingzoo, smax
+from dae_ros.worlds import pettingzoo, smac, smax
 from dae_ros.worlds.base import JointObservation, Transition, Worlds
 from dae_ros.worlds.matrix_game import MatrixGame
 from dae_ros.worlds.pettingzoo import PettingZooWorlds
+from dae_ros.worlds.smac import SmacWorlds
 from dae_ros.worlds.smax import SmaxWorlds
 from dae_ros.worlds.tasks import Formation, Line, Navigation
 
@@ -26,6 +27,7 @@ BUILT_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
 
 PLUGGED_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
     pettingzoo.PREFIX: PettingZooWorlds,
+    smac.PREFIX: SmacWorlds,
     smax.PREFIX: SmaxWorlds,
 }
 
@@ -42,7 +44,7 @@ def make_worlds(task: TaskSettings) -> Worlds:
     for prefix, make in PLUGGED_IN.items():
         if task.task.startswith(prefix):
             return make(task)
-    raise SettingsError(f'unknown task {task.task!r}; there are {", ".join(BUILT_IN)}, pettingzoo:MODULE and smax:MAP')
+    raise SettingsError(f'unknown task {task.task!r}; there are {", ".join(BUILT_IN)}, pettingzoo:MODULE, smac:MAP and smax:MAP')
 
 
 def world_spec(task: TaskSettings) -> WorldSpec:
