@@ -133,17 +133,16 @@ def processes(endpoints: list[TopicEndpointInfo]) -> set[bytes]:
 
 def make_agents() -> list[TeamNode]:
     """The agents that the command line asks for: for a training, or of a trained team. Raises SettingsError."""
-    with settings_of_process('agent', [*DECLARED, *declarations(ExecutionSettings), SETTINGS['seed']]) as asked:
-        first, count, group, world_groups = (asked[name] for name in ('robot', 'robots', 'group', 'world_groups'))
-        make = AgentNode
-        if asked['execute'] or asked['policy_file']:
-            from dae_ros_nodes.robot_agent import RobotAgentNode
+    asked = settings_of_process('agent', [*DECLARED, *declarations(ExecutionSettings), SETTINGS['seed']])
+    first, count, group, world_groups = (asked[name] for name in ('robot', 'robots', 'group', 'world_groups'))
+    make = AgentNode
+    if asked['execute'] or asked['policy_file']:
+        from dae_ros_nodes.robot_agent import RobotAgentNode
 
-            make = RobotAgentNode
-        if count == 1:
-            return [make()]
-        agents = [make(names.agent_node(robot, group, world_groups), robot=robot, robots=1)
-                  for robot in range(first, first + count)]
+        make = RobotAgentNode
+    if count == 1:
+        return [make()]
+    agents = [make(names.agent_node(robot, group, world_groups), robot=robot, robots=1) for robot in range(first, first + count)]
     if len({agent.get_name() for agent in agents}) < count:
         raise SettingsError(f'the agents of {count} robots cannot all be named {agents[0].get_name()}; leave __node to each')
     return agents

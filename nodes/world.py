@@ -112,12 +112,11 @@ class WorldNode(TeamNode):
 def make_world() -> TeamNode:
     """The world that the command line asks for: in lockstep, or our robots. Raises SettingsError."""
     declared = declarations(TaskSettings, GroupBinding, RunBinding, BodySettings, RobotWorldSettings)
-    with settings_of_process('world', [*declared, SETTINGS['seed']]) as asked:
-        if not asked['real_time_factor']:
-            return WorldNode()
-        from dae_ros_nodes.robot_world import RobotWorldNode
+    if not settings_of_process('world', [*declared, SETTINGS['seed']])['real_time_factor']:
+        return WorldNode()
+    from dae_ros_nodes.robot_world import RobotWorldNode
 
-        return RobotWorldNode()
+    return RobotWorldNode()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import gc
 import signal
 from collections import Counter
-from contextlib import contextmanager
-from typing import Any, Callable, Iterable, Iterator
+from typing import Any, Callable, Iterable
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -154,15 +153,14 @@ class TeamNode(Node):
         """Releases what the node holds beyond ROS; called once, also after an error."""
 
 
-@contextmanager
-def settings_of_process(name: str, declared: Iterable[SettingInfo]) -> Iterator[dict[str, Any]]:
-    """What the command line says before the nodes are made whose number and names depend on it. Raises SettingsError.
+def settings_of_process(name: str, declared: Iterable[SettingInfo]) -> dict[str, Any]:
+    """What the command line says before the nodes are made whose number and kind depend on it. Raises SettingsError.
 
-    Only a node can read it; this one must not go before others are there, since the process's DDS goes with its last node.
+    Only a node can read it. It is gone before a node of the same name is made: the graph takes two of one name for one.
     """
     reader = Node(name, enable_rosout=False, start_parameter_services=False, automatically_declare_parameters_from_overrides=True)
     try:
-        yield params.declare(reader, declared)
+        return params.declare(reader, declared)
     finally:
         reader.destroy_node()
 
