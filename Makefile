@@ -2,7 +2,7 @@
 # PYTHON names the interpreter for .venv; without it, set-up takes the first suitable one it finds.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help build demo test chaos bench bench-peers reproduce lint lock clean
+.PHONY: help build smax demo test chaos bench bench-peers reproduce lint lock clean
 export PYTHON
 # Those of the named options that have a value, as the program takes them.
 given = $(foreach option,$(1),$(if $($(option)),--$(option) $($(option))))
@@ -12,6 +12,9 @@ help:  ## list the targets
 
 build:  ## set up .venv and build both packages; does nothing when that is done
 	@scripts/setup.sh
+
+smax: build  ## add JaxMARL to .venv, for the battles of SMAX; needs CPython 3.11 or newer
+	@.venv/bin/uv pip install --python .venv/bin/python --no-deps -r requirements/smax.txt
 
 demo: build  ## train cooperative navigation over a ROS graph on this machine; ARGS goes to bringup
 	@. scripts/env.sh && exec install/dae_ros/lib/dae_ros/bringup config/demo.yaml $(ARGS)
