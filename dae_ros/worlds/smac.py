@@ -37,8 +37,8 @@ class SmacWorlds(Worlds):
         if task.observe_others or task.reward_delay or task.episode_steps:
             raise SettingsError(f'observe_others, reward_delay and episode_steps do not belong to {task.task}')
         if importlib.util.find_spec('smac') is None:
-            raise WorldError(f'{task.task} needs SMAC (`pip install git+https://github.com/oxwhirl/smac.git`) and StarCraft II 4.10 '
-                             'with its maps, where SC2PATH says')
+            raise WorldError(f'{task.task} needs SMAC, the Python package of oxwhirl/smac, and StarCraft II 4.10 with its maps, '
+                             'where SC2PATH says')
         self.num_worlds = task.num_worlds
         self._games = [_Game(task.task.removeprefix(PREFIX), world) for world in range(task.num_worlds)]
         try:

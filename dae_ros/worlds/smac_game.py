@@ -74,7 +74,8 @@ def play(environment: Any, commands: BinaryIO, replies: BinaryIO) -> None:
         if ended:
             environment.reset()
         reply = Reply(float(reward), bool(ended) and command == b's', bool(told.get('episode_limit')),
-                      bool(told.get('battle_won')), final_state, np.asarray(environment.get_obs(), np.float32), np.asarray(environment.get_state(), np.float32),
+                      bool(told.get('battle_won')), final_state,
+                      *(np.asarray(shown(), np.float32) for shown in (environment.get_obs, environment.get_state)),
                       np.asarray(environment.get_avail_actions()) > 0)
         replies.write(reply.to_bytes())
         replies.flush()
