@@ -127,5 +127,5 @@ def test_a_map_that_the_game_does_not_take_is_an_error(smac):
 
 
 def test_without_smac_one_sentence_says_what_to_install():
-    with pytest.raises(WorldError, match='needs SMAC .* and StarCraft II'):
+    with pytest.raises(WorldError, match='needs SMAC, .* and StarCraft II'):
         make_worlds(TaskSettings(task='smac:2s3z', num_agents=5))
