@@ -23,6 +23,7 @@ setup(
         ('share/dae_ros/launch', sorted(glob('launch/*.py'))),
     ],
     python_requires='>=3.10',
+    extras_require={'smax': ['jaxmarl==0.2.0']},
     install_requires=['matplotlib', 'numpy', 'pillow', 'pyyaml', 'rich', 'rosbags', 'safetensors', 'tensorboard', 'torch'],
     zip_safe=False,
     author='dae_ros maintainers',
