@@ -32,8 +32,9 @@ def setting(default, help_text: str, *, unit: str = '', minimum=None, maximum=No
 class TaskSettings:
     """What is simulated. World and trainer need it."""
 
-    task: str = setting('navigation', "navigation, formation, line, matrix_game, or pettingzoo:MODULE for a PettingZoo "
-                                      "parallel environment with discrete actions, e.g. pettingzoo:mpe2.simple_spread_v3")
+    task: str = setting('navigation', "navigation, formation, line, matrix_game, particle:MODULE for a task of robots in "
+                                      "the plane of your own, or pettingzoo:MODULE for a PettingZoo parallel environment "
+                                      "with discrete actions, e.g. pettingzoo:mpe2.simple_spread_v3")
     num_agents: int = setting(3, 'robots of the team (N)', unit='robots', minimum=1, maximum=1000)
     num_worlds: int = setting(128, 'worlds simulated side by side (W); a real team has 1', unit='worlds',
                               minimum=1, maximum=65536)
