@@ -3,8 +3,8 @@ from glob import glob
 
 from setuptools import find_packages, setup
 
-EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'player', 'recorder', 'replay_trainer', 'robot_bridge',
-                'stream_trainer', 'task_monitor', 'train_reward', 'trainer', 'world')
+EXECUTABLES = ('agent', 'bringup', 'credit', 'export_policy', 'parameter_server', 'player', 'recorder', 'replay_trainer',
+               'robot_bridge', 'stream_trainer', 'task_monitor', 'train_reward', 'trainer', 'world')
 
 setup(
     name='dae_ros',

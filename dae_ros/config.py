@@ -279,6 +279,17 @@ class TrainerSettings:
 
     run_folder: str = setting('', 'folder for settings, metrics, checkpoints and policy; empty takes '
                                   'runs/<task>_n<robots>_seed<seed>. A folder with a checkpoint of the same run resumes it')
+    watched_world: int = setting(-1, 'world whose robots\' credit is published after each update, on robot_<i>/credit; '
+                                     '-1 for none', minimum=-1, maximum=65535)
+
+
+@dataclass(frozen=True)
+class CreditSettings:
+    """Whose credit is told without a trainer, and by what."""
+
+    reward_network_file: str = setting('', 'file of train_reward with the reward networks that tell')
+    world: int = setting(0, 'world that is watched, of those side by side; a real team has only world 0', minimum=0,
+                         maximum=65535)
 
 
 @dataclass(frozen=True)
