@@ -23,6 +23,7 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=['matplotlib', 'numpy', 'pillow', 'pyyaml', 'rich', 'rosbags', 'safetensors', 'tensorboard', 'torch'],
+    extras_require={'onnx': ['onnx']},  # export_policy
     zip_safe=False,
     author='dae_ros maintainers',
     author_email='dae_ros@example.org',

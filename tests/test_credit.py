@@ -114,9 +114,9 @@ def test_a_training_keeps_the_credit_of_the_watched_world_and_its_weights_do_not
             baselines = np.zeros((12, 3))  # what tells the robots' advantages apart
             if not values:
                 expected = training.expected_rewards(trajectory)
-                goes_on = 1.0 - trajectory.terminated[:, WORLD, None]
-                baselines = credit_baselines(torch.from_numpy(expected[:, [WORLD]]), torch.from_numpy(goes_on).float(), 0.95, 0.99,
-                                             0.95)[:, 0].numpy()
+                goes_on = torch.from_numpy(~trajectory.terminated[:, [WORLD]]).float()
+                given = settings.learner.beta, settings.learner.gamma, settings.learner.gae_lambda
+                baselines = credit_baselines(torch.from_numpy(expected[:, [WORLD]]), goes_on, *given)[:, 0].numpy()
             training.consume(trajectory)
             if not watching:
                 assert training.credit is None
@@ -128,7 +128,8 @@ def test_a_training_keeps_the_credit_of_the_watched_world_and_its_weights_do_not
             if values:
                 assert training.credit.differences is None
             else:
-                np.testing.assert_array_equal(training.credit.differences, trajectory.rewards[:, WORLD, None] - expected[:, WORLD])
+                differences = trajectory.rewards[..., None] - expected
+                np.testing.assert_array_equal(training.credit.differences, differences[:, WORLD])
         training.close()
         weights.append(training.weights_sha256())
     assert weights[0] == weights[1]

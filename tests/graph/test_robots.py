@@ -219,7 +219,7 @@ def test_a_robot_bringup_that_cannot_begin_says_why(domain, tmp_path):
 def test_the_commands_of_the_documentation_drive_a_robot(stage, processes):
     """The agent's and the bridge's, with the service that enables it; bringup's is tried above."""
     commands = ''.join(re.findall(r'```bash\n(.*?)```', (REPOSITORY / 'docs/robots.md').read_text(), re.DOTALL)).splitlines()
-    execute, agent, bridge, enable, stream = commands
+    execute, agent, bridge, enable, stream, *_ = commands
     assert 'bringup navigation --execute navigation --simulate' in execute and 'bringup streaming --stream --simulate' in stream
     for name, command in (('agent_0', agent), ('bridge_0', bridge)):
         assert f'__node:={name}' in command
