@@ -18,6 +18,8 @@ setup(
         ('share/dae_ros/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
         ('share/dae_ros/config/policies', sorted(glob('config/policies/*.safetensors'))),
         ('share/dae_ros/config/bags', sorted(glob('config/bags/*.yaml'))),
+        ('share/dae_ros/config/rviz', ['config/rviz/team.rviz']),
+        ('share/dae_ros/config/foxglove', ['config/foxglove/team.json']),
         ('share/dae_ros/config/sros2', sorted(glob('config/sros2/*.xml'))),
         ('share/dae_ros/launch', sorted(glob('launch/*.py'))),
     ],
