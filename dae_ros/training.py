@@ -15,7 +15,6 @@ import numpy as np
 
 from dae_ros import config
 from dae_ros.config import Settings
-from dae_ros.errors import SettingsError
 from dae_ros.files import write_atomically
 from dae_ros.learning import reward_files
 from dae_ros.learning.credit import Credit
@@ -145,9 +144,7 @@ class Training:
         self._wait_until_saved()
 
     def watch(self, world: int) -> None:
-        """From here on `credit` tells who earned what in this world. Raises SettingsError if there is no such world."""
-        if world >= self.settings.task.num_worlds:
-            raise SettingsError(f'watched_world must be -1 or lie in 0 .. {self.settings.task.num_worlds - 1}, not {world}')
+        """From here on `credit` tells who earned what in this world."""
         self._learner.watched_world = world
 
     @property

@@ -111,6 +111,8 @@ def bring_up(arguments: argparse.Namespace) -> int:
     """The run that the arguments describe, or this process's part of its learning. The exit code."""
     if arguments.simulate and not (arguments.execute or arguments.stream):
         raise SettingsError('--simulate goes with --execute POLICY or --stream')
+    if arguments.watch is not None and (arguments.execute or arguments.in_process):
+        raise SettingsError('--watch goes with a training on the graph')
     if arguments.execute:
         execute(arguments)
         return 0

@@ -30,7 +30,7 @@ from dae_ros.config import (
     declarations,
     from_flat,
 )
-from dae_ros.errors import DaeRosError, StalledError
+from dae_ros.errors import DaeRosError, SettingsError, StalledError
 from dae_ros.final_report import write_report
 from dae_ros.learning.distributed import help_to_learn
 from dae_ros.restarts import EXIT_REFUSED
@@ -69,6 +69,8 @@ class TrainingNode(TeamNode):
         folder, watched = self.settings.pop('run_folder'), self.settings.pop('watched_world')
         self._key = team_key(self, self.settings.pop('key_file'))
         settings = from_flat(self.settings)
+        if watched >= settings.task.num_worlds:
+            raise SettingsError(f'watched_world must be -1 or lie in 0 .. {settings.task.num_worlds - 1}, not {watched}')
         spec = world_spec(settings.task)
         folder = Path(folder or f'runs/{settings.task.task.replace(":", "_")}_n{spec.num_agents}_seed{settings.run.seed}')
         self._folder = RunFolder(folder, settings)

@@ -135,14 +135,6 @@ def test_a_training_keeps_the_credit_of_the_watched_world_and_its_weights_do_not
     assert weights[0] == weights[1]
 
 
-def test_a_world_that_is_not_there_cannot_be_watched(tmp_path):
-    settings = config.from_flat(VALUES)
-    training = Training(settings, make_worlds(settings.task).spec, RunFolder(tmp_path, settings))
-    with pytest.raises(SettingsError, match='watched_world must be -1 or lie in 0 .. 3, not 4'):
-        training.watch(4)
-    training.close()
-
-
 def test_a_file_that_holds_something_else_is_named(tmp_path):
     (tmp_path / 'text').write_text('nothing')
     for path, sentence in ((tmp_path / 'nowhere', 'cannot read reward_network_file .*nowhere: No such file'),

@@ -210,6 +210,7 @@ def test_bringup_drives_a_simulated_team_until_it_is_stopped_and_leaves_nothing(
 def test_a_robot_bringup_that_cannot_begin_says_why(domain, tmp_path):
     for arguments, sentence in ((['--execute', 'nowhere'], 'there is no policy file nowhere'),
                                 (['--execute', 'navigation', '-p', 'max_sped:=1'], "did you mean 'max_speed'?"),
+                                (['--execute', 'navigation', '--watch', '0'], '--watch goes with a training on the graph'),
                                 (['--simulate'], '--simulate goes with --execute POLICY')):
         done = subprocess.run([sys.executable, '-m', 'dae_ros_nodes.bringup', 'navigation', *arguments], cwd=tmp_path,
                               capture_output=True, text=True, timeout=TIMEOUT)
