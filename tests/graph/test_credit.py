@@ -133,6 +133,6 @@ def test_beside_robots_a_task_monitor_and_the_node_tell_and_show_who_earns_what(
         processes.stop()
     differences, expected = [message.vector.y for message in told], said(CreditMeter(load(file), 0), states, actions, rewards)
     assert np.ptp(differences) > 0.01 and all(np.isnan(message.vector.z) for message in told)
-    np.testing.assert_allclose(differences, expected[-len(differences):], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(differences, expected[:len(differences)], rtol=1e-5, atol=1e-5)
     texts = {float(marker.text) for array in shown for marker in array.markers if (marker.ns, marker.id) == ('credit', 1)}
     assert texts <= {round(difference, 3) for difference in differences}
