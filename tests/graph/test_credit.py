@@ -77,9 +77,10 @@ def test_bringup_has_the_trainer_tell_the_credit_of_the_world_it_is_asked_to_wat
     with Listener() as listener:
         listener.node.create_subscription(Vector3Stamped, names.CREDIT.format(2), heard.append, qos.ROLLOUT)
         values = {**SMALL, 'beta': 0.0, 'total_steps': 2 * 8 * STEPS, 'evaluation_episodes': 0}
-        code, _, errors = finish(bringup(tmp_path / 'run', values, '--watch', str(WORLD)))
-        assert code == 0, errors
-        listener.spin_until(lambda: len(heard) == 2 * STEPS, lambda: str(len(heard)))
+        process = bringup(tmp_path / 'run', values, '--watch', str(WORLD))
+        listener.spin_until(lambda: len(heard) == 2 * STEPS or process.poll() is not None)
+        code, _, errors = finish(process)
+    assert code == 0 and len(heard) == 2 * STEPS, f'{len(heard)} {errors}'
     assert all(np.isnan(message.vector.y) and np.isfinite([message.vector.x, message.vector.z]).all() for message in heard)
 
 
