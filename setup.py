@@ -3,8 +3,8 @@ from glob import glob
 
 from setuptools import find_packages, setup
 
-EXECUTABLES = ('agent', 'bringup', 'parameter_server', 'player', 'recorder', 'replay_trainer', 'robot_bridge',
-                'stream_trainer', 'task_monitor', 'train_reward', 'trainer', 'world')
+EXECUTABLES = ('agent', 'bringup', 'credit', 'export_policy', 'parameter_server', 'player', 'recorder', 'replay_trainer',
+               'robot_bridge', 'stream_trainer', 'task_monitor', 'train_reward', 'trainer', 'world')
 
 setup(
     name='dae_ros',
@@ -19,12 +19,14 @@ setup(
         ('share/dae_ros/config/policies', sorted(glob('config/policies/*.safetensors'))),
         ('share/dae_ros/config/bags', sorted(glob('config/bags/*.yaml'))),
         ('share/dae_ros/config/smac', sorted(glob('config/smac/*.yaml'))),
+        ('share/dae_ros/config/rviz', ['config/rviz/team.rviz']),
+        ('share/dae_ros/config/foxglove', ['config/foxglove/team.json']),
         ('share/dae_ros/config/sros2', sorted(glob('config/sros2/*.xml'))),
         ('share/dae_ros/launch', sorted(glob('launch/*.py'))),
     ],
     python_requires='>=3.10',
-    extras_require={'smax': ['jaxmarl==0.2.0']},
     install_requires=['matplotlib', 'numpy', 'pillow', 'pyyaml', 'rich', 'rosbags', 'safetensors', 'tensorboard', 'torch'],
+    extras_require={'onnx': ['onnx'], 'smax': ['jaxmarl==0.2.0']},
     zip_safe=False,
     author='dae_ros maintainers',
     author_email='dae_ros@example.org',

@@ -32,9 +32,10 @@ def setting(default, help_text: str, *, unit: str = '', minimum=None, maximum=No
 class TaskSettings:
     """What is simulated. World and trainer need it."""
 
-    task: str = setting('navigation', "navigation, formation, line, matrix_game, pettingzoo:MODULE for a PettingZoo parallel "
-                                      "environment with discrete actions, e.g. pettingzoo:mpe2.simple_spread_v3, or smax:MAP "
-                                      "and smac:MAP for battles, e.g. smax:2s3z")
+    task: str = setting('navigation', "navigation, formation, line, matrix_game, particle:MODULE for a task of robots in the plane "
+                                      "of your own, pettingzoo:MODULE for a PettingZoo parallel environment with discrete "
+                                      "actions, e.g. pettingzoo:mpe2.simple_spread_v3, or smax:MAP and smac:MAP for battles, "
+                                      "e.g. smax:2s3z")
     num_agents: int = setting(3, 'robots of the team (N)', unit='robots', minimum=1, maximum=1000)
     num_worlds: int = setting(128, 'worlds simulated side by side (W); a real team has 1', unit='worlds',
                               minimum=1, maximum=65536)
@@ -279,6 +280,17 @@ class TrainerSettings:
 
     run_folder: str = setting('', 'folder for settings, metrics, checkpoints and policy; empty takes '
                                   'runs/<task>_n<robots>_seed<seed>. A folder with a checkpoint of the same run resumes it')
+    watched_world: int = setting(-1, 'world whose robots\' credit is published after each update, on robot_<i>/credit; '
+                                     '-1 for none', minimum=-1, maximum=65535)
+
+
+@dataclass(frozen=True)
+class CreditSettings:
+    """Whose credit is told without a trainer, and by what."""
+
+    reward_network_file: str = setting('', 'file of train_reward with the reward networks that tell')
+    world: int = setting(0, 'world that is watched, of those side by side; a real team has only world 0', minimum=0,
+                         maximum=65535)
 
 
 @dataclass(frozen=True)

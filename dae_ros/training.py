@@ -17,6 +17,7 @@ from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.files import write_atomically
 from dae_ros.learning import reward_files
+from dae_ros.learning.credit import Credit
 from dae_ros.learning.distributed import make_learner
 from dae_ros.learning.estimators import ExpectedRewards
 from dae_ros.learning.policy import Policy
@@ -141,6 +142,15 @@ class Training:
         """Writes a checkpoint of the training as it stands; FileError if one could not be written."""
         self._begin_to_save()
         self._wait_until_saved()
+
+    def watch(self, world: int) -> None:
+        """From here on `credit` tells who earned what in this world."""
+        self._learner.watched_world = world
+
+    @property
+    def credit(self) -> Credit | None:
+        """Who earned what in the watched world, in the last rollout learnt from; None if there is none."""
+        return self._learner.credit
 
     def expected_rewards(self, trajectory: Trajectory) -> np.ndarray:
         """As `Learner.expected_rewards`."""

@@ -42,6 +42,8 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--execute', metavar='POLICY', help='drive robots with a trained team: a policy file, the name of one '
                                                             'that comes with the package, or parameter_server for what that has')
     parser.add_argument('--stream', action='store_true', help='train with robots that act at their own rate')
+    parser.add_argument('--watch', type=int, metavar='WORLD', help='publish who earns what in this world after each update, on '
+                                                               'robot_<i>/credit')
     parser.add_argument('--simulate', action='store_true', help='with --execute or --stream: our simulator plays the robots')
     return parser.parse_args(arguments)
 
@@ -65,22 +67,23 @@ def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDis
         worlds.close()
 
 
-def train_on_graph(settings: Settings, folder: RunFolder, namespace: str, key_file: str, display: ProgressDisplay) -> None:
+def train_on_graph(settings: Settings, folder: RunFolder, arguments: argparse.Namespace, display: ProgressDisplay) -> None:
     """The run as separate processes. Raises DaeRosError when it cannot go on."""
-    from dae_ros.ros.graph import training_graph
+    from dae_ros.ros.graph import training_graph, watching
     from dae_ros.ros.graph_run import GraphRun
 
-    GraphRun(settings, folder, namespace, display, training_graph(settings, folder, key_file)).run()
+    processes = watching(training_graph(settings, folder, arguments.key_file), arguments.watch)
+    GraphRun(settings, folder, arguments.namespace, display, processes).run()
 
 
 def train_on_robots(settings: Settings, folder: RunFolder, arguments: argparse.Namespace, display: ProgressDisplay) -> None:
     """The run as a stream of what robots do. Raises DaeRosError when it cannot go on."""
     from dae_ros.ros.execution import streaming_graph
-    from dae_ros.ros.graph import read_values
+    from dae_ros.ros.graph import read_values, watching
     from dae_ros.ros.graph_run import GraphRun
 
     values = read_values(task_file_of(arguments), arguments.parameter)
-    processes = streaming_graph(settings, values, folder, arguments.simulate, arguments.key_file)
+    processes = watching(streaming_graph(settings, values, folder, arguments.simulate, arguments.key_file), arguments.watch)
     GraphRun(settings, folder, arguments.namespace, display, processes).run()
 
 
@@ -108,6 +111,8 @@ def bring_up(arguments: argparse.Namespace) -> int:
     """The run that the arguments describe, or this process's part of its learning. The exit code."""
     if arguments.simulate and not (arguments.execute or arguments.stream):
         raise SettingsError('--simulate goes with --execute POLICY or --stream')
+    if arguments.watch is not None and (arguments.execute or arguments.in_process):
+        raise SettingsError('--watch goes with a training on the graph')
     if arguments.execute:
         execute(arguments)
         return 0
@@ -134,7 +139,7 @@ def bring_up(arguments: argparse.Namespace) -> int:
         elif arguments.in_process:
             train_in_process(settings, folder, display)
         else:
-            train_on_graph(settings, folder, arguments.namespace, arguments.key_file, display)
+            train_on_graph(settings, folder, arguments, display)
     print(Summary.read(folder.summary_file).lines())
     return 0
 

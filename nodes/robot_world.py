@@ -18,9 +18,10 @@ from visualization_msgs.msg import MarkerArray
 from dae_ros.config import SETTINGS, BodySettings, RobotWorldSettings, TaskSettings, declarations
 from dae_ros.robots.bodies import Bodies
 from dae_ros.robots.pilot import stamp_at
+from dae_ros.robots.scene import Scene
 from dae_ros.robots.setup import limits_in, task_frame, task_settings
 from dae_ros.ros import convert_robots, names, qos
-from dae_ros.ros.markers import markers
+from dae_ros.ros.markers import MARKERS_PERIOD, listen_for, markers
 from dae_ros.ros.node import TeamNode
 
 try:
@@ -28,8 +29,7 @@ try:
 except ImportError:  # the wheels lack it
     TFMessage = None
 
-MARKERS_PERIOD = 0.1  # s of simulated time
-BEGINNING = 1.0       # s, where a clock of our own begins
+BEGINNING = 1.0  # s, where a clock of our own begins
 
 
 class RobotWorldNode(TeamNode):
@@ -46,11 +46,13 @@ class RobotWorldNode(TeamNode):
         command = TwistStamped if settings['stamped'] else Twist
         self._odometry = [self.publisher(Odometry, names.ODOMETRY.format(i), qos.NEWEST) for i in robots]
         self._landmarks = self.publisher(PoseArray, names.LANDMARKS, qos.LATCHED)
+        self._scene = Scene(task.num_agents, self._bodies.radius)
         self._markers = self.publisher(MarkerArray, names.MARKERS, qos.NEWEST)
         self._clock_out = self.publisher(Clock, names.CLOCK, qos.NEWEST) if self._is_clock else None
         self._transforms = TFMessage and self.publisher(TFMessage, names.TRANSFORMS, qos.EVENTS)
         for i in robots:
             self.listen(command, names.COMMAND.format(i), qos.SENSOR, partial(self._on_command, i))
+        listen_for(self, self._scene)
         self.create_service(Trigger, names.NEXT_EPISODE, self._on_next_episode)
         self._show_landmarks()
         steady = SystemClock(clock_type=ClockType.STEADY_TIME)
@@ -92,7 +94,9 @@ class RobotWorldNode(TeamNode):
             self._transforms.publish(TFMessage(transforms=[self._transform(robot, now) for robot in range(len(self._odometry))]))
         if not 0.0 <= now - self._shown < MARKERS_PERIOD:
             self._shown = now
-            self._markers.publish(markers(self._bodies, now, self._world_frame))
+            bodies = self._bodies
+            self._scene.show(bodies.positions, bodies.headings, bodies.landmarks, bodies.targets)
+            self._markers.publish(markers(self._scene, now, self._world_frame))
 
     def _body_frame(self, robot: int) -> str:
         """Two teams have frames of their own, as they have topics of their own."""

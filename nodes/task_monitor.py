@@ -1,4 +1,4 @@
-"""task_monitor: tells the trainer state and reward of a team of robots, from their odometry; training needs no simulator.
+"""task_monitor: tells state and reward of a team of robots, from their odometry, and shows it; training needs no simulator.
 
     ros2 run dae_ros task_monitor --ros-args -p task:=navigation -p num_agents:=3 -p run:=<the trainer's>
 """
@@ -11,11 +11,14 @@ from functools import partial
 from dae_ros_msgs import msg
 from geometry_msgs.msg import PoseArray
 from nav_msgs.msg import Odometry
+from visualization_msgs.msg import MarkerArray
 
 from dae_ros.config import BodySettings, BridgeSettings, RunBinding, TaskSettings, declarations
 from dae_ros.robots.pilot import LOOKS
+from dae_ros.robots.scene import Scene
 from dae_ros.robots.setup import make_watch
 from dae_ros.ros import convert, convert_robots, names, qos
+from dae_ros.ros.markers import MARKERS_PERIOD, listen_for, markers
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.types import JointState
 
@@ -33,6 +36,10 @@ class TaskMonitorNode(TeamNode):
             self.listen(Odometry, names.ODOMETRY.format(robot), qos.SENSOR, partial(self._on_odometry, robot))
         self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
         self.every(1.0 / (LOOKS * settings['control_rate']), self._look)
+        self._scene = Scene(settings['num_agents'], self._watch.radius)
+        self._markers = self.publisher(MarkerArray, names.MARKERS, qos.NEWEST)
+        listen_for(self, self._scene)
+        self.every(MARKERS_PERIOD, self._show)
 
     def _on_odometry(self, robot: int, message: Odometry) -> None:
         now = self.now()
@@ -48,6 +55,13 @@ class TaskMonitorNode(TeamNode):
                 self._joint_state.publish(convert.joint_state_message(seen, state_is_observations=True))
             else:
                 self._shared_reward.publish(convert.shared_reward_message(seen))
+
+    def _show(self) -> None:
+        """Shows the team, unless our simulator plays it and does so itself."""
+        now = self.now()
+        if not self._watch.blind_for(now) and self.count_publishers(names.MARKERS) == 1:
+            self._watch.show(self._scene)
+            self._markers.publish(markers(self._scene, now, self._world_frame))
 
     def diagnose(self):
         blind = self._watch.blind_for(self.now())

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any, Callable, NamedTuple
 
 from dae_ros_msgs import msg
+from geometry_msgs.msg import Vector3Stamped
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
+from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
@@ -28,12 +30,12 @@ from dae_ros.config import (
     declarations,
     from_flat,
 )
-from dae_ros.errors import DaeRosError, StalledError
+from dae_ros.errors import DaeRosError, SettingsError, StalledError
 from dae_ros.final_report import write_report
 from dae_ros.learning.distributed import help_to_learn
 from dae_ros.restarts import EXIT_REFUSED
 from dae_ros.rollout.groups import GroupedAssembler
-from dae_ros.ros import convert, names, qos
+from dae_ros.ros import convert, convert_robots, names, qos
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.ros.trust import team_key
 from dae_ros.run_folder import RunFolder
@@ -41,6 +43,7 @@ from dae_ros.training import Training
 from dae_ros.types import RolloutRequest, Trajectory
 from dae_ros.weights.codec import encode_policy, seal
 from dae_ros.worlds import world_spec
+from dae_ros.worlds.particle import TIME_STEP
 
 Status = msg.TrainingStatus
 FAREWELL = Duration(seconds=2)  # to let the last status reach who listens
@@ -63,14 +66,17 @@ class TrainingNode(TeamNode):
         super().__init__(name, [*declarations(TaskSettings, LearnerSettings, RewardNetworkSettings, RunSettings, TrainerSettings,
                                               TeamKey), *more])
         self._more = {info.name: self.settings.pop(info.name) for info in more}
-        folder = self.settings.pop('run_folder')
+        folder, watched = self.settings.pop('run_folder'), self.settings.pop('watched_world')
         self._key = team_key(self, self.settings.pop('key_file'))
         settings = from_flat(self.settings)
+        if watched >= settings.task.num_worlds:
+            raise SettingsError(f'watched_world must be -1 or lie in 0 .. {settings.task.num_worlds - 1}, not {watched}')
         spec = world_spec(settings.task)
         folder = Path(folder or f'runs/{settings.task.task.replace(":", "_")}_n{spec.num_agents}_seed{settings.run.seed}')
         self._folder = RunFolder(folder, settings)
         self._training = Training(settings, spec, self._folder)
         self._state = Status.WAITING
+        self._credit = self._watch(watched) if watched >= 0 else []
         self._policy_update = self.publisher(msg.PolicyWeights, names.POLICY_UPDATE, qos.LATCHED)
         self._status = self.publisher(Status, names.TRAINING_STATUS, qos.LATCHED)
         self.create_service(Trigger, names.SAVE, self._on_save)
@@ -83,6 +89,7 @@ class TrainingNode(TeamNode):
         self._training.consume(trajectory)
         if self._training.policy_version != version:
             self._publish_policy()
+            self._publish_credit()
 
     def _request_rollout(self) -> RolloutRequest:
         """The rollout wanted now."""
@@ -98,6 +105,18 @@ class TrainingNode(TeamNode):
         self.done = True
 
     # What others see.
+
+    def _watch(self, world: int) -> list[Publisher]:
+        """Where each robot's credit in a world goes."""
+        self._training.watch(world)
+        return [self.publisher(Vector3Stamped, names.CREDIT.format(robot), qos.ROLLOUT)
+                for robot in range(self._training.spec.num_agents)]
+
+    def _publish_credit(self) -> None:
+        begin = (self._training.policy_version - 1) * self._training.settings.run.num_steps
+        for robot, publisher in enumerate(self._credit):
+            for message in convert_robots.credit_messages(self._training.credit, robot, begin * TIME_STEP, TIME_STEP):
+                publisher.publish(message)
 
     def _publish_policy(self) -> None:
         if not self.context.ok():

@@ -23,5 +23,5 @@ def test_the_spec_tells_the_shapes_without_the_worlds(task):
 
 
 def test_an_unknown_task_is_answered_with_those_there_are():
-    with pytest.raises(SettingsError, match="'navigate'; there are navigation, formation, line, matrix_game, pett"):
+    with pytest.raises(SettingsError, match="'navigate'; there are navigation, formation, line, matrix_game, particle:M"):
         make_worlds(TaskSettings(task='navigate'))

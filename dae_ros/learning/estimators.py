@@ -33,6 +33,7 @@ class Estimate(NamedTuple):
     advantages: Tensor          # [T, W, N], not normalised
     trainings: list[Training]   # of its networks
     metrics: dict[str, float]
+    expected: Tensor | None     # E over a_i ~ pi_i of the reward, [T, W, N]; None without a reward network
 
 
 class ActionNetwork:
@@ -133,7 +134,7 @@ class DifferenceEstimator:
         chunks = ValueChunks(cut(data.states[:-1].unsqueeze(2)), cut(data.episode_start[:-1]), cut(normalized_values[:-1]),
                              cut(self._value_norm.normalize(targets)), cut(torch.ones_like(data.rewards)))
         first = first_states(critic_states[:-1], chunks.weights.shape[0])
-        return Estimate(estimated, [self._critic_training(chunks, first, rollout), *trainings], metrics)
+        return Estimate(estimated, [self._critic_training(chunks, first, rollout), *trainings], metrics, expected)
 
     def expected_rewards(self, data: Trajectory) -> Tensor:
         """E over a_i ~ pi_i of the predicted reward, [T, W, N]. Raises ValueError at beta = 0, which has no reward network."""
@@ -243,7 +244,7 @@ class CounterfactualEstimator:
         batches = self._passes.epochs(network.name, chunks, first_states(states, len(chunks.weights)), self._epochs,
                                       settings.num_mini_batches, rollout)
         return Estimate(estimated, [network.training(batches, 'action_value/loss')],
-                        {'action_value/explained_variance': float(explained)})
+                        {'action_value/explained_variance': float(explained)}, None)
 
     def networks(self) -> dict[str, FlatAdam]:
         return {self._action_value.name: self._action_value.adam}

@@ -17,6 +17,7 @@ from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.errors import SettingsError
 from dae_ros.learning import advantages, losses
 from dae_ros.learning.chunks import PolicyChunks, agent_weights, first_states, to_chunks
+from dae_ros.learning.credit import Credit, credit_of_world
 from dae_ros.learning.estimators import ESTIMATORS, DifferenceEstimator, ExpectedRewards, chunk_length
 from dae_ros.learning.networks import make_actor
 from dae_ros.learning.optimizer import FlatAdam
@@ -34,6 +35,8 @@ class Learner:
         """`team`: the `distributed.Team` this process learns with, None to learn alone. `device`: where it computes.
         `exact_rewards`: tells DAE the truth about E[r], in place of reward networks; for studies in simulators."""
         self._spec = spec
+        self.watched_world: int | None = None  # whose credit is kept
+        self.credit: Credit | None = None      # there, in the last rollout learnt from
         self._settings = settings
         self._passes = Passes(settings.learner_threads, seed, device, team)
         self._actor = FlatAdam(make_actor(spec, settings, seed).to(device), settings.learning_rate, settings.adam_epsilon,
@@ -55,7 +58,9 @@ class Learner:
         data = self._tensors(trajectory)
         _, actor_states = self._passes.forward(self._actor.network, self._spec.num_agents, data.observations,
                                                data.episode_start[:-1])
-        estimated, trainings, metrics = self._estimator.estimate(data, rollout)
+        estimated, trainings, metrics, expected = self._estimator.estimate(data, rollout)
+        if self.watched_world is not None:
+            self.credit = credit_of_world(self.watched_world, data.rewards, expected, estimated)
         metrics['advantage/deviation'] = float(advantages.among(estimated, data.present).std(correction=0))
 
         # Lines 21 to 24: chunks, with the recurrent states they begin with.

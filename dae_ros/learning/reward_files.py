@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Iterable
+from typing import Any, Iterable, NamedTuple
 
 import numpy as np
+import torch
 
+from dae_ros import config
 from dae_ros.config import RewardNetworkSettings
 from dae_ros.errors import Refused, SettingsError
 from dae_ros.learning.networks import RewardNetwork, make_reward_network
 from dae_ros.types import WorldSpec
 from dae_ros.weights.codec import decode_reward_network, encode_reward_network
+
+LARGEST = 2**24  # size that a file may ask for
+
+
+class RewardNetworks(NamedTuple):
+    """The networks of a file, and what they are made for."""
+
+    spec: WorldSpec  # of which they know no observation_size
+    recurrent: bool
+    members: list[RewardNetwork]
 
 
 def encode(networks: Iterable[RewardNetwork], spec: WorldSpec, settings: RewardNetworkSettings) -> bytes:
@@ -26,26 +38,59 @@ def read(spec: WorldSpec, settings: RewardNetworkSettings) -> list[dict[str, np.
 
     SettingsError if they name none, if it cannot be read or if its networks are of another kind.
     """
-    path = Path(settings.path)
     if not settings.path:
         raise SettingsError('reward_network.freeze keeps the networks of a file: name it in reward_network.path')
-    try:
-        tensors, found = decode_reward_network(path.read_bytes())
-    except OSError as error:
-        raise SettingsError(f'cannot read reward_network.path {path}: {error.strerror}') from error
-    except Refused as refusal:
-        raise SettingsError(f'reward_network.path {path} is not a file of train_reward: {refusal.detail}') from refusal
+    path = Path(settings.path)
+    tensors, found = _decoded(path, 'reward_network.path')
     asked = _schema(spec, settings)
     different = [f'{name} is {found.get(name)!r} there and {value!r} here' for name, value in asked.items()
                  if found.get(name) != value]
     if different:
         raise SettingsError(f'the reward networks in {path} do not fit this run: {", ".join(different)}; train some from bags of '
                             'this task, or change the settings')
+    return _members(path, tensors, spec, settings)
+
+
+def load(path: Path) -> RewardNetworks:
+    """The networks in a file, whatever they are made for. SettingsError if it cannot be read or holds none."""
+    tensors, found = _decoded(path, 'reward_network_file')
+    members = found.pop('members', None)
+    sizes = [found.pop(name, None) for name in ('num_agents', 'num_actions', 'state_size')]
+    try:
+        if not all(type(size) is int and 0 < size < LARGEST for size in sizes):
+            raise SettingsError('sizes that no team has')
+        values = {f'reward_network.{name}': value for name, value in {**found, 'ensemble_size': members}.items()}
+        settings = config.from_flat(values).reward_network
+    except SettingsError as error:
+        raise SettingsError(f'{path} holds no reward networks that are known here: {error}') from error
+    spec = WorldSpec(sizes[0], sizes[1], 0, sizes[2], False)
+    networks = []
+    for parameters in _members(path, tensors, spec, settings):
+        network = make_reward_network(spec, settings, 0, 0)
+        network.load_state_dict({name: torch.from_numpy(tensor.copy()) for name, tensor in parameters.items()})
+        networks.append(network)
+    return RewardNetworks(spec, settings.recurrent, networks)
+
+
+def _decoded(path: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors and schema of the file that the setting `name` names."""
+    try:
+        return decode_reward_network(path.read_bytes())
+    except OSError as error:
+        raise SettingsError(f'cannot read {name} {path}: {error.strerror}') from error
+    except Refused as refusal:
+        raise SettingsError(f'{name} {path} is not a file of train_reward: {refusal.detail}') from refusal
+
+
+def _members(path: Path, tensors: dict[str, np.ndarray], spec: WorldSpec,
+             settings: RewardNetworkSettings) -> list[dict[str, np.ndarray]]:
+    """Each network's parameters by name."""
     expected = {name: tuple(parameter.shape)
                 for name, parameter in make_reward_network(spec, settings, 0, 0).named_parameters()}
-    members = [{name: tensors.get(f'{member}.{name}', np.empty(0)) for name in expected} for member in range(asked['members'])]
+    members = [{name: tensors.get(f'{member}.{name}', np.empty(0)) for name in expected}
+               for member in range(settings.ensemble_size)]
     if any(tensor.shape != expected[name] for member in members for name, tensor in member.items()):
-        raise SettingsError(f'reward_network.path {path} lacks tensors of the networks it says it holds: train it anew')
+        raise SettingsError(f'{path} lacks tensors of the networks it says it holds: train it anew')
     return members
 
 

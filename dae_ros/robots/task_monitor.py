@@ -56,6 +56,11 @@ class TaskMonitor:
         return self._worlds.episode_steps
 
     @property
+    def radius(self) -> float:
+        """Of a robot, in task units."""
+        return self._worlds.radius
+
+    @property
     def targets(self) -> np.ndarray:
         """The N places the team should cover, [N, 2] in task units, as of the last sight."""
         return self._worlds.targets[0]

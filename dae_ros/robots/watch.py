@@ -10,6 +10,7 @@ from dae_ros.errors import Refused
 from dae_ros.robots.geometry import TaskFrame
 from dae_ros.robots.pilot import stamp_at
 from dae_ros.robots.safety import Bounds, Track
+from dae_ros.robots.scene import Scene
 from dae_ros.robots.task_monitor import Sight, TaskMonitor
 from dae_ros.types import JointState, SharedReward, Stamp
 
@@ -32,12 +33,24 @@ class Watch:
             raise Refused(Refused.WRONG_SHAPE, f'{len(landmarks)} landmarks, the task has {self._monitor.num_landmarks}')
         self._landmarks = landmarks
 
+    @property
+    def radius(self) -> float:
+        """Of a robot, in m."""
+        return self._monitor.radius * self._frame.scale
+
     def blind_for(self, now: float) -> str:
         """Whose odometry is too old at `now`, or what else is missing; '' if everything is seen."""
         old = [str(robot) for robot, track in enumerate(self.tracks) if track.age(now) > self._bounds.odometry_timeout]
         if old:
             return f'the odometry of robot {", ".join(old)}'
         return '' if self._landmarks is not None else 'the landmarks'
+
+    def show(self, scene: Scene) -> None:
+        """Has the scene show everybody as last heard of; nothing must be missing (`blind_for`)."""
+        poses = [track.pose for track in self.tracks]
+        self._see()
+        scene.show(np.array([pose.position for pose in poses]), np.array([pose.heading for pose in poses]), self._landmarks,
+                   self._frame.metres(self._monitor.targets))
 
     def look(self, now: float) -> list[Seen]:
         """What there is to say at `now` [s]; nothing while somebody's odometry is too old, which leaves a hole."""

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, Iterator
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, PoseArray, Quaternion, TransformStamped, Twist, TwistStamped, Vector3
+from geometry_msgs.msg import Point, PoseArray, Quaternion, TransformStamped, Twist, TwistStamped, Vector3, Vector3Stamped
 from geometry_msgs.msg import Pose as PoseMessage
 from nav_msgs.msg import Odometry
 
 from dae_ros.errors import Refused
 from dae_ros.robots.geometry import Pose, heading_of, quaternion_of, turned
 from dae_ros.robots.motion import Command
+
+if TYPE_CHECKING:
+    from dae_ros.learning.credit import Credit
 
 NANOSECONDS = 1_000_000_000
 
@@ -85,6 +88,19 @@ def command_message(command: Command, stamped: bool, time: float, body_frame: st
     message = TwistStamped(twist=twist)
     message.header.frame_id, message.header.stamp = body_frame, time_message(time)
     return message
+
+
+def credit_messages(credit: Credit, robot: int, begin: float, period: float) -> Iterator[Vector3Stamped]:
+    """A robot's credit of each step: x the team's reward, y the robot's difference reward, z its advantage; nan where not known.
+
+    The steps are `period` [s] apart, from `begin` [s] on.
+    """
+    unknown = np.full(len(credit.rewards), np.nan)
+    ys, zs = (unknown if part is None else part[:, robot] for part in (credit.differences, credit.advantages))
+    for step, (x, y, z) in enumerate(zip(credit.rewards, ys, zs)):
+        message = Vector3Stamped(vector=Vector3(x=float(x), y=float(y), z=float(z)))
+        message.header.stamp = time_message(begin + step * period)
+        yield message
 
 
 def command(message: Twist | TwistStamped) -> Command:

@@ -55,6 +55,14 @@ def training_graph(settings: Settings, folder: RunFolder, key_file: str = '') ->
     ]
 
 
+def watching(processes: list[NodeProcess], world: int | None) -> list[NodeProcess]:
+    """The same, with a trainer that publishes the credit in this world; None for no world."""
+    if world is None:
+        return processes
+    return [process._replace(parameters={**process.parameters, 'watched_world': world})
+            if process.executable in ('trainer', 'stream_trainer') else process for process in processes]
+
+
 def key_parameters(key_file: str) -> dict[str, str]:
     """What those who sign policies or take them are told."""
     return {'key_file': str(Path(key_file).absolute())} if key_file else {}

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dae_ros.config import TaskSettings
 from dae_ros.errors import SettingsError
 from dae_ros.types import WorldSpec
-from dae_ros.worlds import pettingzoo, smac, smax
+from dae_ros.worlds import own_particle, pettingzoo, smac, smax
 from dae_ros.worlds.base import JointObservation, Transition, Worlds
 from dae_ros.worlds.matrix_game import MatrixGame
 from dae_ros.worlds.pettingzoo import PettingZooWorlds
@@ -26,6 +26,7 @@ BUILT_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
 }
 
 PLUGGED_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
+    own_particle.PREFIX: own_particle.make,
     pettingzoo.PREFIX: PettingZooWorlds,
     smac.PREFIX: SmacWorlds,
     smax.PREFIX: SmaxWorlds,
@@ -35,8 +36,8 @@ PLUGGED_IN: dict[str, Callable[[TaskSettings], Worlds]] = {
 def make_worlds(task: TaskSettings) -> Worlds:
     """The worlds of one group of those `task` asks for, not yet reset; all groups' are alike and differ in their draws.
 
-    Raises SettingsError for an unknown task or settings that do not fit it, WorldError where a PettingZoo environment
-    cannot be used.
+    Raises SettingsError for an unknown task or settings that do not fit it, WorldError where a module or its
+    environment cannot be used.
     """
     task = side_by_side(task, task.worlds_per_group)
     if task.task in BUILT_IN:
@@ -44,7 +45,8 @@ def make_worlds(task: TaskSettings) -> Worlds:
     for prefix, make in PLUGGED_IN.items():
         if task.task.startswith(prefix):
             return make(task)
-    raise SettingsError(f'unknown task {task.task!r}; there are {", ".join(BUILT_IN)}, pettingzoo:MODULE, smac:MAP and smax:MAP')
+    raise SettingsError(f'unknown task {task.task!r}; there are {", ".join(BUILT_IN)}, particle:MODULE, pettingzoo:MODULE, '
+                        'smac:MAP and smax:MAP')
 
 
 def world_spec(task: TaskSettings) -> WorldSpec:

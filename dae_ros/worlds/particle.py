@@ -32,17 +32,18 @@ WORLDS_AT_ONCE = 256  # in a transposition
 class ParticleWorlds(SynchronousWorlds):
     """W worlds of N discs and L landmarks; a task adds where they start and what is rewarded.
 
-    An observation is (velocity, position, landmarks - position, others - position, zeros), each part x before y.
-    The state is the N observations one after another.
+    An observation is (velocity, position, landmarks - position, others - position, own features), each part x before y. Own
+    features are zeros unless the task overrides `_look`. The state is the N observations one after another.
     """
 
     radius: float            # of a disc
     num_landmark_draws: int  # uniform numbers that `_place_landmarks` needs per world
 
-    def __init__(self, task: TaskSettings, num_landmarks: int, observe_others: bool, unused_features: int = 0):
+    def __init__(self, task: TaskSettings, num_landmarks: int, observe_others: bool, own_features: int = 0):
+        """`own_features`: how many numbers the task adds to an observation, a multiple of 2."""
         num_agents, num_worlds = task.num_agents, task.num_worlds
         num_others = num_agents - 1 if observe_others else 0
-        size = 4 + 2 * num_landmarks + 2 * num_others + unused_features
+        size = 4 + 2 * num_landmarks + 2 * num_others + own_features
         spec = WorldSpec(num_agents, ACTION_FORCE.shape[1], size, num_agents * size, state_is_observations=True)
         super().__init__(spec, task, task.episode_steps or EPISODE_STEPS)
         self._task = task
@@ -54,6 +55,7 @@ class ParticleWorlds(SynchronousWorlds):
         self._position = vectors[:, :, 1]                            # [2, N, W]
         self._to_landmarks = vectors[:, :, 2:2 + num_landmarks]      # [2, N, L, W]
         self._to_others = vectors[:, :, 2 + num_landmarks:2 + num_landmarks + num_others]  # [2, N, N-1, W]
+        self._own_features = self._features[:, size - own_features:]  # [N, own_features, W]
         self._landmarks = np.zeros((2, num_landmarks, num_worlds))
         self._first, self._second = np.triu_indices(num_agents, k=1)
         agents = np.arange(num_agents)
@@ -138,7 +140,7 @@ class ParticleWorlds(SynchronousWorlds):
         return state.reshape(self.num_worlds, self.spec.num_agents, self.spec.observation_size), state
 
     def _look(self) -> None:
-        """Bring the relative positions in the observations up to date."""
+        """Bring the observations up to date with `_position` and `_landmarks`."""
         own = self._position[:, :, None]
         np.subtract(self._landmarks[:, None], own, out=self._to_landmarks)
         if self._others.size:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import random
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from dae_ros.config import TaskSettings
 from dae_ros.errors import SettingsError, WorldError
 from dae_ros.types import WorldSpec
 from dae_ros.worlds.base import JointObservation, Transition, Worlds, check_actions
+from dae_ros.worlds.modules import module_of
 
 PREFIX = 'pettingzoo:'
 
@@ -195,15 +195,10 @@ def _joint_observation(shown: JointObservation, episode_start: np.ndarray) -> Jo
 
 
 def _find_parallel_env(task: str) -> Any:
-    module_name = task.removeprefix(PREFIX)
-    try:
-        module = importlib.import_module(module_name)
-    except (ImportError, ValueError, TypeError) as error:
-        raise WorldError(f'cannot import {module_name!r} ({error}); install its package or correct the name after '
-                         f'{PREFIX}') from error
+    module = module_of(task, PREFIX)
     build = getattr(module, 'parallel_env', None)
     if not callable(build):
-        raise WorldError(f'{module_name} has no parallel_env, so it is not a PettingZoo parallel environment')
+        raise WorldError(f'{module.__name__} has no parallel_env, so it is not a PettingZoo parallel environment')
     return build
 
 

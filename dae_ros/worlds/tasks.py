@@ -22,7 +22,7 @@ class Navigation(ParticleWorlds):
 
     def __init__(self, task: TaskSettings):
         num_agents = task.num_agents
-        super().__init__(task, num_agents, observe_others=True, unused_features=2 * (num_agents - 1))
+        super().__init__(task, num_agents, observe_others=True, own_features=2 * (num_agents - 1))
         self.num_landmark_draws = 2 * num_agents
 
     def _place_landmarks(self, uniform: np.ndarray) -> None:

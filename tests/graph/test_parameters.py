@@ -53,6 +53,8 @@ def test_an_unknown_key_in_a_parameter_file_is_an_error_too(domain, tmp_path):
     ('agent', 'key_file:=missing.key', 'cannot read key_file missing.key: No such file or directory'),
     ('parameter_server', 'key_file:=/dev/null', 'key_file /dev/null must be a file of 32 to 4096 bytes that nobody can guess'),
     ('trainer', 'key_file:=/dev/null', 'key_file /dev/null must be a file of 32 to 4096 bytes that nobody can guess'),
+    ('trainer', 'watched_world:=128', 'watched_world must be -1 or lie in 0 .. 127, not 128'),
+    ('credit', 'world:=1', 'set reward_network_file to a file of train_reward'),
     ('trainer', 'world_groups:=3', 'num_worlds = 128 worlds cannot be split into world_groups = 3 groups of equal size'),
 ])
 def test_a_wrong_value_is_one_sentence(node, override, sentence, domain):

@@ -183,7 +183,8 @@ def test_our_simulator_plays_robots_that_the_same_bridges_drive(domain, stage, p
     stage.spin_until(lambda: len(odometry) == 3 and landmarks and distance() < CLOSE)
     stage.spin_until(lambda: bool(shown))
     kinds = Counter(marker.ns for marker in shown[-1].markers)
-    assert kinds == {'robots': 3, 'headings': 3, 'landmarks': 3, 'targets': 3}
+    assert kinds == {'robots': 3, 'headings': 3, 'landmarks': 3, 'targets': 3, 'trails': 3, 'contacts': 1, 'actions': 12}
+    assert any(marker.ns == 'actions' and marker.action == marker.ADD for marker in shown[-1].markers)
     assert stage.call(Trigger, 'robots/next_episode', Trigger.Request()).message == 'episode 1'
     stage.spin_until(lambda: distance() > CLOSE)
     stage.spin_until(lambda: distance() < CLOSE)
@@ -209,6 +210,7 @@ def test_bringup_drives_a_simulated_team_until_it_is_stopped_and_leaves_nothing(
 def test_a_robot_bringup_that_cannot_begin_says_why(domain, tmp_path):
     for arguments, sentence in ((['--execute', 'nowhere'], 'there is no policy file nowhere'),
                                 (['--execute', 'navigation', '-p', 'max_sped:=1'], "did you mean 'max_speed'?"),
+                                (['--execute', 'navigation', '--watch', '0'], '--watch goes with a training on the graph'),
                                 (['--simulate'], '--simulate goes with --execute POLICY')):
         done = subprocess.run([sys.executable, '-m', 'dae_ros_nodes.bringup', 'navigation', *arguments], cwd=tmp_path,
                               capture_output=True, text=True, timeout=TIMEOUT)
@@ -219,7 +221,7 @@ def test_a_robot_bringup_that_cannot_begin_says_why(domain, tmp_path):
 def test_the_commands_of_the_documentation_drive_a_robot(stage, processes):
     """The agent's and the bridge's, with the service that enables it; bringup's is tried above."""
     commands = ''.join(re.findall(r'```bash\n(.*?)```', (REPOSITORY / 'docs/robots.md').read_text(), re.DOTALL)).splitlines()
-    execute, agent, bridge, enable, stream = commands
+    execute, agent, bridge, enable, stream, *_ = commands
     assert 'bringup navigation --execute navigation --simulate' in execute and 'bringup streaming --stream --simulate' in stream
     for name, command in (('agent_0', agent), ('bridge_0', bridge)):
         assert f'__node:={name}' in command
