@@ -32,8 +32,8 @@ def setting(default, help_text: str, *, unit: str = '', minimum=None, maximum=No
 class TaskSettings:
     """What is simulated. World and trainer need it."""
 
-    task: str = setting('navigation', "navigation, formation, line, matrix_game, particle:MODULE for a task of robots in the plane "
-                                      "of your own, pettingzoo:MODULE for a PettingZoo parallel environment with discrete "
+    task: str = setting('navigation', "navigation, formation, line, matrix_game, particle:MODULE for a task of robots in "
+                                      "the plane of your own, pettingzoo:MODULE for a PettingZoo parallel environment with discrete "
                                       "actions, e.g. pettingzoo:mpe2.simple_spread_v3, or smax:MAP and smac:MAP for battles, "
                                       "e.g. smax:2s3z")
     num_agents: int = setting(3, 'robots of the team (N)', unit='robots', minimum=1, maximum=1000)
@@ -244,6 +244,16 @@ class BridgeSettings:
 
 
 @dataclass(frozen=True)
+class RobotBagSettings:
+    """Where a bag of robots, without any message of ours, has what. Only train_reward needs it."""
+
+    odometry_topic: str = setting('robot_{}/odom', "a robot's odometry in a bag, {} for its index; or the topics of all "
+                                                   'robots with blanks between them')
+    command_topic: str = setting('robot_{}/cmd_vel', 'the velocities a robot was told, likewise; Twist or TwistStamped')
+    landmarks_topic: str = setting('landmarks', 'where the landmarks are, in a bag')
+
+
+@dataclass(frozen=True)
 class ParameterServerSettings:
     """What is particular to the parameter server."""
 
@@ -362,7 +372,8 @@ SETTINGS: dict[str, SettingInfo] = {info.name: info for info in declarations(*ge
 """Those of a run, which a task file may set."""
 
 ROBOT_SETTINGS: dict[str, SettingInfo] = {
-    info.name: info for info in declarations(ExecutionSettings, BodySettings, RobotWorldSettings, BridgeSettings, StreamSettings)}
+    info.name: info for info in declarations(ExecutionSettings, BodySettings, RobotWorldSettings, BridgeSettings,
+                                             RobotBagSettings, StreamSettings)}
 """Those of trained teams on robots; a task file may set them too, each node takes its own."""
 
 

@@ -19,6 +19,7 @@ from std_srvs.srv import SetBool
 
 from dae_ros.config import AgentSettings, BodySettings, BridgeSettings, RunBinding, TaskSettings, declarations
 from dae_ros.errors import Refused, SettingsError
+from dae_ros.robots import standard_messages
 from dae_ros.robots.motion import STOP, Command
 from dae_ros.robots.pilot import LOOKS, Turn
 from dae_ros.robots.safety import Stop
@@ -62,12 +63,12 @@ class RobotBridgeNode(TeamNode):
         now = self.now()
         if now == 0.0:  # simulated time has not begun
             return
-        self._pilot.on_odometry(robot, convert_robots.odometry(message, self._world_frame), now)
+        self._pilot.on_odometry(robot, standard_messages.odometry(message, self._world_frame), now)
         if robot == self.settings['robot']:
             self._body_frame = message.child_frame_id
 
     def _on_landmarks(self, message: PoseArray) -> None:
-        self._pilot.on_landmarks(convert_robots.landmarks(message, self._world_frame))
+        self._pilot.on_landmarks(standard_messages.landmarks(message, self._world_frame))
 
     def _take_landmarks(self, text: str) -> None:
         try:

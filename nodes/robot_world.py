@@ -16,6 +16,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from dae_ros.config import SETTINGS, BodySettings, RobotWorldSettings, TaskSettings, declarations
+from dae_ros.robots import standard_messages
 from dae_ros.robots.bodies import Bodies
 from dae_ros.robots.pilot import stamp_at
 from dae_ros.robots.scene import Scene
@@ -62,7 +63,7 @@ class RobotWorldNode(TeamNode):
         return self._time if self._is_clock else super().now()
 
     def _on_command(self, robot: int, message: Twist | TwistStamped) -> None:
-        self._bodies.obey(robot, convert_robots.command(message), self.now())
+        self._bodies.obey(robot, standard_messages.command(message), self.now())
 
     def _on_next_episode(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._begin(self._episode + 1)

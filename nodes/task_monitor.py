@@ -14,10 +14,11 @@ from nav_msgs.msg import Odometry
 from visualization_msgs.msg import MarkerArray
 
 from dae_ros.config import BodySettings, BridgeSettings, RunBinding, TaskSettings, declarations
+from dae_ros.robots import standard_messages
 from dae_ros.robots.pilot import LOOKS
 from dae_ros.robots.scene import Scene
 from dae_ros.robots.setup import make_watch
-from dae_ros.ros import convert, convert_robots, names, qos
+from dae_ros.ros import convert, names, qos
 from dae_ros.ros.markers import MARKERS_PERIOD, listen_for, markers
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.types import JointState
@@ -44,10 +45,10 @@ class TaskMonitorNode(TeamNode):
     def _on_odometry(self, robot: int, message: Odometry) -> None:
         now = self.now()
         if now:
-            self._watch.tracks[robot].take(convert_robots.odometry(message, self._world_frame), now)
+            self._watch.tracks[robot].take(standard_messages.odometry(message, self._world_frame), now)
 
     def _on_landmarks(self, message: PoseArray) -> None:
-        self._watch.on_landmarks(convert_robots.landmarks(message, self._world_frame))
+        self._watch.on_landmarks(standard_messages.landmarks(message, self._world_frame))
 
     def _look(self) -> None:
         for seen in self._watch.look(self.now()):

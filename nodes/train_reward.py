@@ -16,10 +16,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from dae_ros import config
 from dae_ros.command import run_command
-from dae_ros.config import SETTINGS, RewardTrainingSettings, TaskSettings, declarations
+from dae_ros.config import (
+    SETTINGS,
+    BodySettings,
+    BridgeSettings,
+    RewardTrainingSettings,
+    RobotBagSettings,
+    TaskSettings,
+    declarations,
+)
 from dae_ros.errors import DaeRosError
 from dae_ros.files import write_atomically
 from dae_ros.replay.dataset import Dataset
+from dae_ros.replay.robot_dataset import RobotDataset
+from dae_ros.ros.graph import read_values
 from dae_ros.weights.codec import sha256
 
 OWN = {info.name: info for info in declarations(RewardTrainingSettings)}
@@ -28,6 +38,7 @@ SHARED = {name: SETTINGS[name] for name in (
     'reward_network.ensemble_size', 'reward_network.learning_rate', 'chunk_length', 'adam_epsilon', 'max_gradient_norm',
     'seed', 'device', 'learner_threads')}
 KNOWN = {**OWN, **SHARED}
+ROBOTS = {info.name: info for info in declarations(TaskSettings, BodySettings, BridgeSettings, RobotBagSettings)}
 
 
 def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
@@ -38,21 +49,35 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
                         help='bags (folders or files) and glob patterns')
     parser.add_argument('--output', type=Path, default=Path('runs/reward_network.safetensors'),
                         help='the file to write; the report goes to a folder beside it (default %(default)s)')
-    parser.add_argument('--task', type=Path, metavar='FILE',
-                        help='task file, or settings.yaml of the run, that was recorded: its simulator then tells the true E[r], '
-                             'and the report how far from it the predictions are')
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument('--robots', type=Path, metavar='FILE',
+                       help='task file of a team of robots whose odometry, velocity commands and landmarks the bags hold, '
+                            'without any message of ours; -p then takes its settings too')
+    kinds.add_argument('--task', type=Path, metavar='FILE',
+                       help='task file, or settings.yaml of the run, that was recorded: its simulator then tells the true E[r], '
+                            'and the report how far from it the predictions are')
     parser.add_argument('-p', '--parameter', action='append', default=[], metavar='NAME:=VALUE', help='change a setting')
     return parser.parse_args(arguments)
 
 
-def read_settings(overrides: list[str]) -> tuple[config.Settings, RewardTrainingSettings]:
+def read_settings(arguments: argparse.Namespace) -> tuple[config.Settings, RewardTrainingSettings]:
     """The settings with the overrides put in. Raises SettingsError."""
-    values = dict(config.parse_override(text) for text in overrides)
+    values = dict(config.parse_override(text) for text in arguments.parameter)
+    known = {**KNOWN, **ROBOTS} if arguments.robots else KNOWN
     for name in values:
-        if name not in KNOWN:
-            raise config.unknown_setting(name, KNOWN)
+        if name not in known:
+            raise config.unknown_setting(name, known)
     own = {name: OWN[name].check(value) for name, value in values.items() if name in OWN}
     return config.from_flat({name: value for name, value in values.items() if name in SHARED}), RewardTrainingSettings(**own)
+
+
+def read_bags(arguments: argparse.Namespace) -> Dataset | RobotDataset:
+    """The bags: ours, or those of robots. Raises BagError and SettingsError."""
+    if not arguments.robots:
+        return Dataset(*arguments.bag)
+    of_robots = [text for text in arguments.parameter if config.parse_override(text)[0] not in KNOWN]
+    values = {name: info.default for name, info in ROBOTS.items()}
+    return RobotDataset(*arguments.bag, settings={**values, **read_values(arguments.robots, of_robots)})
 
 
 def read_task(path: Path) -> TaskSettings:
@@ -60,7 +85,7 @@ def read_task(path: Path) -> TaskSettings:
     return config.from_flat(config.load_task_file(path)).task
 
 
-def train(dataset: Dataset, arguments: argparse.Namespace, console: Console) -> None:
+def train(dataset: Dataset | RobotDataset, arguments: argparse.Namespace, console: Console) -> None:
     """Trains, writes file and report, and says what came of it. Raises DaeRosError."""
     from dae_ros.credit_probe import accuracy, recorded_expected_rewards
     from dae_ros.replay.reward_training import RewardTraining  # torch takes seconds to load, and a wrong setting none
@@ -69,7 +94,7 @@ def train(dataset: Dataset, arguments: argparse.Namespace, console: Console) -> 
     def say(text: str) -> None:
         console.print(text, markup=False, soft_wrap=True)
 
-    settings, own = read_settings(arguments.parameter)
+    settings, own = read_settings(arguments)
     columns = TextColumn('{task.description}'), BarColumn(bar_width=None), MofNCompleteColumn(), TextColumn('rollouts')
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task('reading', total=None)
@@ -115,10 +140,10 @@ def main(args: list[str] | None = None) -> int:
     arguments = parse_arguments(args)
 
     def act() -> int:
-        read_settings(arguments.parameter)
+        read_settings(arguments)
         if arguments.task:
             read_task(arguments.task)
-        train(Dataset(*arguments.bag), arguments, Console(highlight=False))
+        train(read_bags(arguments), arguments, Console(highlight=False))
         return 0
 
     return run_command(act, 'stopped; nothing was written')

@@ -194,5 +194,5 @@ def test_a_message_that_a_recording_lacks_is_counted(bag, tmp_path):
 
 def test_bags_are_read_and_learnt_from_in_small(bag):
     assert bags.reading(bag, 2) > 0
-    found = bags.learning(bag, config.from_flat({**TEAM, **bags.NETWORK, 'reward_network.hidden_size': 16}), max_epochs=2)
+    found = bags.learning(bag, config.from_flat({**TEAM, **bags.NETWORK, 'reward_network.hidden_size': 16}), 64, max_epochs=2)
     assert found['times_better'] == pytest.approx(found['mean_reward_error'] / found['held_out_error'])

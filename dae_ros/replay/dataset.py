@@ -55,12 +55,13 @@ class Dataset:
                 self.skipped[str(error)] += 1
         joiner.end()
         if not self.rollouts:
-            raise BagError('no rollout can be read: ' + (self.describe_skipped() or f'no messages of ours in {len(self._bags)} '
-                                                         f'bag{"s" * (len(self._bags) != 1)}'))
+            bags = f'{len(self._bags)} bag{"s" * (len(self._bags) != 1)}'
+            raise BagError('no rollout can be read: ' + (
+                self.describe_skipped() or f'no messages of ours in {bags}; those of robots need their task file, with --robots'))
 
     def describe_skipped(self) -> str:
         """What was skipped and why, for people."""
-        return ', '.join(f'{reason} ({count})' if count > 1 else reason for reason, count in sorted(self.skipped.items()))
+        return describe(self.skipped)
 
     def _fits(self, spec: WorldSpec, rollout: Rollout) -> bool:
         """Counts a rollout as used if its sizes are those of the first."""
@@ -73,3 +74,8 @@ class Dataset:
         self.rollouts += 1
         self.environment_steps += steps * num_worlds
         return True
+
+
+def describe(skipped: Counter[str]) -> str:
+    """What was skipped and why, for people."""
+    return ', '.join(f'{reason} ({count})' if count > 1 else reason for reason, count in sorted(skipped.items()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import NamedTuple
 
@@ -61,6 +62,25 @@ class Motion:
         body = turned(self._velocity, -heading)
         self._command = self._along_and_turn(body) if self._differential else Command(*body)
         return self._command
+
+    def begin(self, told: Command, heading: float) -> None:
+        """Goes on from the middle of a motion: the robot, which heads to `heading` [rad], does as it was told."""
+        self._velocity = turned((told.forward, told.left), heading)
+        self._command = told
+
+    def likely_action(self, told: Command, heading: float) -> int:
+        """The action whose command is nearest to what the robot was told, in shares of its limits; its motion goes on from there.
+        """
+        tried = [copy.copy(self) for _ in range(ACTION_FORCE.shape[1])]
+        distances = [self._distance(motion.act(action, heading), told) for action, motion in enumerate(tried)]
+        action = distances.index(min(distances))
+        self._velocity, self._command = tried[action]._velocity, tried[action]._command
+        return action
+
+    def _distance(self, one: Command, other: Command) -> float:
+        speed, turn_rate = self._limits.speed, self._limits.turn_rate
+        return math.hypot((one.forward - other.forward) / speed, (one.left - other.left) / speed,
+                          (one.turn - other.turn) / turn_rate)
 
     def _along_and_turn(self, body: tuple[float, float]) -> Command:
         """Along its axis goes what points there, forward or backward; it turns the nearer end to where it should go."""

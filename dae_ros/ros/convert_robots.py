@@ -1,4 +1,4 @@
-"""As `dae_ros.ros.convert`, for the standard messages that robots speak: odometry, landmarks, velocity commands, markers."""
+"""Makes the standard messages that robots speak; `dae_ros.robots.standard_messages` reads them."""
 
 from __future__ import annotations
 
@@ -10,39 +10,17 @@ from geometry_msgs.msg import Point, PoseArray, Quaternion, TransformStamped, Tw
 from geometry_msgs.msg import Pose as PoseMessage
 from nav_msgs.msg import Odometry
 
-from dae_ros.errors import Refused
-from dae_ros.robots.geometry import Pose, heading_of, quaternion_of, turned
+from dae_ros.robots.geometry import Pose, quaternion_of, turned
 from dae_ros.robots.motion import Command
+from dae_ros.robots.standard_messages import NANOSECONDS
 
 if TYPE_CHECKING:
     from dae_ros.learning.credit import Credit
-
-NANOSECONDS = 1_000_000_000
-
-
-def seconds(time: Time) -> float:
-    return time.sec + time.nanosec / NANOSECONDS
 
 
 def time_message(time: float) -> Time:
     whole, part = divmod(round(time * NANOSECONDS), NANOSECONDS)
     return Time(sec=whole, nanosec=part)
-
-
-def _check_frame(frame: str, expected: str) -> None:
-    if frame != expected:
-        raise Refused(Refused.WRONG_FRAME, f'frame_id {frame!r}, expected {expected!r}')
-
-
-def odometry(message: Odometry, world_frame: str) -> Pose:
-    """Pose in the world frame, which the message must be in. Its twist is in `child_frame_id`, the robot's body as a rule."""
-    _check_frame(message.header.frame_id, world_frame)
-    place, orientation, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
-    heading = heading_of(orientation.x, orientation.y, orientation.z, orientation.w)
-    velocity = speed.x, speed.y
-    if message.child_frame_id != world_frame:
-        velocity = turned(velocity, heading)
-    return Pose((place.x, place.y), heading, velocity, seconds(message.header.stamp))
 
 
 def odometry_message(pose: Pose, turn: float, world_frame: str, body_frame: str) -> Odometry:
@@ -66,12 +44,6 @@ def transform_message(pose: Pose, world_frame: str, body_frame: str) -> Transfor
 def pose_message(position: Any, heading: float = 0.0) -> PoseMessage:
     x, y, z, w = quaternion_of(heading)
     return PoseMessage(position=Point(x=float(position[0]), y=float(position[1])), orientation=Quaternion(x=x, y=y, z=z, w=w))
-
-
-def landmarks(message: PoseArray, world_frame: str) -> np.ndarray:
-    """Positions [L, 2] in m, in the world frame, which the message must be in."""
-    _check_frame(message.header.frame_id, world_frame)
-    return np.array([(pose.position.x, pose.position.y) for pose in message.poses], np.float64).reshape(-1, 2)
 
 
 def landmarks_message(positions: np.ndarray, time: float, world_frame: str) -> PoseArray:
@@ -101,12 +73,3 @@ def credit_messages(credit: Credit, robot: int, begin: float, period: float) -> 
         message = Vector3Stamped(vector=Vector3(x=float(x), y=float(y), z=float(z)))
         message.header.stamp = time_message(begin + step * period)
         yield message
-
-
-def command(message: Twist | TwistStamped) -> Command:
-    """Raises Refused where it is not finite."""
-    twist = message.twist if isinstance(message, TwistStamped) else message
-    found = Command(twist.linear.x, twist.linear.y, twist.angular.z)
-    if not np.isfinite(found).all():
-        raise Refused(Refused.NOT_FINITE, 'a velocity is not finite')
-    return found

@@ -13,7 +13,8 @@ from robots import Processes
 from dae_ros import config
 from dae_ros.learning.networks import make_reward_network
 from dae_ros.learning.reward_files import encode
-from dae_ros.ros import convert_robots, names, qos
+from dae_ros.robots import standard_messages
+from dae_ros.ros import names, qos
 from dae_ros.ros.graph import watching
 from dae_ros.worlds import world_spec
 
@@ -63,7 +64,7 @@ def test_the_trainer_and_a_node_with_its_reward_networks_tell_the_same_differenc
         by_trainer, by_node = (numbers[which] for which in (~np.isnan(numbers[:, 2]), np.isnan(numbers[:, 2])))
         np.testing.assert_allclose(by_node[:len(by_trainer), :2], by_trainer[:, :2], rtol=1e-5, atol=1e-5)
         assert len(by_trainer) == STEPS * UPDATES and np.ptp(by_trainer[:, 1]) > 0.1 and np.ptp(by_trainer[:, 2]) > 0.1
-        times = [convert_robots.seconds(message.header.stamp) for message in said if not np.isnan(message.vector.z)]
+        times = [standard_messages.seconds(message.header.stamp) for message in said if not np.isnan(message.vector.z)]
         np.testing.assert_allclose(times, 0.1 * np.arange(STEPS * UPDATES))
 
 

@@ -21,8 +21,9 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from dae_ros.report.summary import Summary
+from dae_ros.robots import standard_messages
 from dae_ros.robots.acting import ActingEnd
-from dae_ros.ros import convert_robots, names, qos
+from dae_ros.ros import names, qos
 from dae_ros.weights.codec import decode_policy
 
 LAYOUTS, NEEDED = 20, 16
@@ -155,9 +156,9 @@ def test_the_navigation_team_covers_the_landmarks_with_foreign_differential_robo
     for layout in range(1, LAYOUTS + 1):
         assert stage.call(Trigger, 'next_layout', Trigger.Request()).message == f'layout {layout}'
         stage.spin_until(lambda: len(landmarks) >= layout and truth)
-        begin = convert_robots.seconds(truth[-1].header.stamp)
-        stage.spin_until(lambda: convert_robots.seconds(truth[-1].header.stamp) > begin + SECONDS)
-        robots, places = (convert_robots.landmarks(message, 'map') for message in (truth[-1], landmarks[-1]))
+        begin = standard_messages.seconds(truth[-1].header.stamp)
+        stage.spin_until(lambda: standard_messages.seconds(truth[-1].header.stamp) > begin + SECONDS)
+        robots, places = (standard_messages.landmarks(message, 'map') for message in (truth[-1], landmarks[-1]))
         distances.append(np.linalg.norm(places[:, None] - robots[None], axis=-1).min(axis=1).mean())
         truth.clear()
     assert sum(distance < CLOSE for distance in distances) >= NEEDED, np.round(distances, 2)
@@ -176,8 +177,8 @@ def test_our_simulator_plays_robots_that_the_same_bridges_drive(domain, stage, p
         stage.node.create_subscription(Odometry, names.ODOMETRY.format(robot), partial(odometry.__setitem__, robot), qos.SENSOR)
 
     def distance():
-        places = convert_robots.landmarks(landmarks[-1], 'map')
-        robots = np.array([convert_robots.odometry(odometry[robot], 'map').position for robot in range(3)])
+        places = standard_messages.landmarks(landmarks[-1], 'map')
+        robots = np.array([standard_messages.odometry(odometry[robot], 'map').position for robot in range(3)])
         return np.linalg.norm(places[:, None] - robots[None], axis=-1).min(axis=1).mean()
 
     stage.spin_until(lambda: len(odometry) == 3 and landmarks and distance() < CLOSE)
