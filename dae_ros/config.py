@@ -32,8 +32,8 @@ def setting(default, help_text: str, *, unit: str = '', minimum=None, maximum=No
 class TaskSettings:
     """What is simulated. World and trainer need it."""
 
-    task: str = setting('navigation', "navigation, formation, line, matrix_game, particle:MODULE for a task of robots in "
-                                      "the plane of your own, pettingzoo:MODULE for a PettingZoo parallel environment with discrete "
+    task: str = setting('navigation', "navigation, formation, line, matrix_game, particle:MODULE for a task of robots in the "
+                                      "plane of your own, pettingzoo:MODULE for a PettingZoo parallel environment with discrete "
                                       "actions, e.g. pettingzoo:mpe2.simple_spread_v3, or smax:MAP and smac:MAP for battles, "
                                       "e.g. smax:2s3z")
     num_agents: int = setting(3, 'robots of the team (N)', unit='robots', minimum=1, maximum=1000)
