@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import signal
 import sys
-from typing import Callable
+from contextlib import contextmanager
+from typing import Callable, Iterator
 
 from dae_ros.errors import DaeRosError, FileError
 from dae_ros.restarts import EXIT_REFUSED
@@ -26,6 +27,7 @@ def run_command(act: Callable[[], int], stopped: str) -> int:
 
 
 _interrupts = 0  # since `interrupt_once`
+_put_off = False  # whether the first one is to wait
 
 
 def interrupt_once() -> None:
@@ -34,12 +36,26 @@ def interrupt_once() -> None:
     def interrupt(number: int, frame) -> None:
         global _interrupts
         _interrupts += 1
-        if _interrupts == 1:
+        if _interrupts == 1 and not _put_off:
             raise KeyboardInterrupt
 
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:  # as in a job that was started in the background
             signal.signal(number, interrupt)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Puts off what `interrupt_once` raises to the end of the block. A blocked signal would not do: another thread takes it, and
+    Python still raises in this one."""
+    global _put_off
+    before, _put_off = _interrupts, True
+    try:
+        yield
+    finally:
+        _put_off = False
+    if _interrupts and not before:
+        raise KeyboardInterrupt
 
 
 def hurried() -> bool:

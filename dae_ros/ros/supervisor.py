@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Callable, Mapping
 
-from dae_ros.command import hurried
+from dae_ros.command import hurried, uninterrupted
 
 GRACE = 8.0  # s from the request to stop until a process is killed
 GLANCE = 0.1  # s between looks at whether it is to hurry
@@ -48,19 +48,10 @@ class Supervisor:
 
     def start(self, name: str, command: list[str], environment: Mapping[str, str]) -> int:
         """Starts a process in a session of its own: Ctrl-C in the terminal reaches the supervisor alone. Its process id."""
-        def prepare() -> None:
-            _end_with_parent()
-            signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
-
-        # An interrupt in the middle would leave a process that nobody knows of.
-        unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-        try:
-            with open(self.log_file(name), 'ab') as log:
-                process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                                           start_new_session=True, preexec_fn=prepare)
+        with uninterrupted(), open(self.log_file(name), 'ab') as log:  # or nobody would know of the process
+            process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                                       start_new_session=True, preexec_fn=_end_with_parent)
             self._processes[name] = process
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
         threading.Thread(target=self._watch, args=(name, process), daemon=True).start()
         return process.pid
 
