@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dae_ros import torchrun
-from dae_ros.command import interrupt_once, run_command
+from dae_ros.command import interrupt_once, run_command, uninterrupted
 from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
 from dae_ros.errors import SettingsError
 
@@ -69,8 +69,9 @@ def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDis
 
 def train_on_graph(settings: Settings, folder: RunFolder, arguments: argparse.Namespace, display: ProgressDisplay) -> None:
     """The run as separate processes. Raises DaeRosError when it cannot go on."""
-    from dae_ros.ros.graph import training_graph, watching
-    from dae_ros.ros.graph_run import GraphRun
+    with uninterrupted():
+        from dae_ros.ros.graph import training_graph, watching
+        from dae_ros.ros.graph_run import GraphRun
 
     processes = watching(training_graph(settings, folder, arguments.key_file), arguments.watch)
     GraphRun(settings, folder, arguments.namespace, display, processes).run()
@@ -121,11 +122,12 @@ def bring_up(arguments: argparse.Namespace) -> int:
 
         help_to_learn()
         return 0
-    # Here, because it takes a second in which Ctrl-C is to be heard.
-    from dae_ros.report.progress import ProgressDisplay
-    from dae_ros.report.summary import Summary
-    from dae_ros.ros.graph import read_settings
-    from dae_ros.run_folder import RunFolder
+    # Here, because it takes a second in which Ctrl-C is to be heard; it waits, since Python tells of one that meets an import.
+    with uninterrupted():
+        from dae_ros.report.progress import ProgressDisplay
+        from dae_ros.report.summary import Summary
+        from dae_ros.ros.graph import read_settings
+        from dae_ros.run_folder import RunFolder
 
     task_file = task_file_of(arguments)
     settings = read_settings(task_file, arguments.parameter)
