@@ -50,10 +50,11 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
 
 def train_in_process(settings: Settings, folder: RunFolder, display: ProgressDisplay) -> None:
     """The run without ROS. Raises KeyboardInterrupt through; what was checkpointed stays."""
-    from dae_ros.final_report import write_report
-    from dae_ros.rollout.in_process import train
-    from dae_ros.training import Training
-    from dae_ros.worlds import make_worlds, world_spec
+    with uninterrupted():
+        from dae_ros.final_report import write_report
+        from dae_ros.rollout.in_process import train
+        from dae_ros.training import Training
+        from dae_ros.worlds import make_worlds, world_spec
 
     training, worlds = Training(settings, world_spec(settings.task), folder), make_worlds(settings.task)
     try:
@@ -79,9 +80,10 @@ def train_on_graph(settings: Settings, folder: RunFolder, arguments: argparse.Na
 
 def train_on_robots(settings: Settings, folder: RunFolder, arguments: argparse.Namespace, display: ProgressDisplay) -> None:
     """The run as a stream of what robots do. Raises DaeRosError when it cannot go on."""
-    from dae_ros.ros.execution import streaming_graph
-    from dae_ros.ros.graph import read_values, watching
-    from dae_ros.ros.graph_run import GraphRun
+    with uninterrupted():
+        from dae_ros.ros.execution import streaming_graph
+        from dae_ros.ros.graph import read_values, watching
+        from dae_ros.ros.graph_run import GraphRun
 
     values = read_values(task_file_of(arguments), arguments.parameter)
     processes = watching(streaming_graph(settings, values, folder, arguments.simulate, arguments.key_file), arguments.watch)
@@ -96,9 +98,10 @@ def task_file_of(arguments: argparse.Namespace) -> Path | None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Drives robots until Ctrl-C."""
-    from dae_ros.ros.execution import execution_graph, find_policy, write_values
-    from dae_ros.ros.execution_run import ExecutionRun
-    from dae_ros.ros.graph import read_values
+    with uninterrupted():
+        from dae_ros.ros.execution import execution_graph, find_policy, write_values
+        from dae_ros.ros.execution_run import ExecutionRun
+        from dae_ros.ros.graph import read_values
 
     values = read_values(task_file_of(arguments), arguments.parameter)
     folder = arguments.run_folder or Path('runs') / f'execution-{datetime.now():%Y%m%d-%H%M%S}'

@@ -10,9 +10,8 @@ import sys
 from pathlib import Path
 
 from dae_ros.command import run_command
-from dae_ros.errors import DaeRosError, Refused
 from dae_ros.files import write_atomically
-from dae_ros.weights.codec import decode_policy
+from dae_ros.weights.codec import decode_policy, read_file
 from dae_ros.weights.onnx_file import encode_onnx
 
 
@@ -25,12 +24,7 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
 
 def export(source: Path, output: Path) -> None:
     """Writes the model and says what goes in and comes out. Raises DaeRosError."""
-    try:
-        policy = decode_policy(source.read_bytes())
-    except OSError as error:
-        raise DaeRosError(f'cannot read {source}: {error.strerror}') from error
-    except Refused as refusal:
-        raise DaeRosError(f'{source} is no policy: {refusal.detail}') from refusal
+    policy = read_file(source, decode_policy, 'the file', 'policy')
     data, sizes = encode_onnx(policy), policy.architecture
     write_atomically(output, data)
     print(f'{output}: observation [W, {sizes.observation_size}], state [W, {sizes.hidden_size}] to probabilities '

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections import Counter
@@ -17,6 +18,8 @@ from dae_ros.replay.gaps import Gaps
 from dae_ros.replay.recording import FLUSH_PERIOD, Recording
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.ros.recorded import RecordedTopic, as_written, team_topics
+
+NICENESS = 5  # the team comes first: what comes while it works is kept until the recorder's turn
 
 
 class RecorderNode(TeamNode):
@@ -65,6 +68,7 @@ class RecorderNode(TeamNode):
 
 
 def main(args: list[str] | None = None) -> int:
+    os.nice(NICENESS)
     return run(RecorderNode, args)
 
 

@@ -14,12 +14,11 @@ from dae_ros_msgs import msg
 from std_srvs.srv import Trigger
 
 from dae_ros.config import SETTINGS, AgentSettings, ExecutionSettings, RunBinding, TeamKey, declarations
-from dae_ros.errors import Refused, SettingsError
 from dae_ros.robots.acting import ActingEnd
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode
 from dae_ros.ros.trust import team_key
-from dae_ros.weights.codec import decode_policy, open_weights
+from dae_ros.weights.codec import decode_policy, open_weights, read_file
 
 DECLARED = [*declarations(AgentSettings, ExecutionSettings, RunBinding, TeamKey), SETTINGS['seed']]
 FROM_FILE = 1, 0  # run and version of a policy whose file says neither
@@ -37,7 +36,7 @@ class RobotAgentNode(TeamNode):
         self._actions = self.publisher(msg.Action, names.ACTION.format(robot), qos.ROLLOUT)
         if path:
             self._end.run = FROM_FILE[0]
-            self._end.on_policy(*FROM_FILE, read_policy(Path(path)))
+            self._end.on_policy(*FROM_FILE, read_file(Path(path), decode_policy, 'policy_file', 'policy'))
         else:
             self._key = team_key(self, self.settings['key_file'])
             self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED_INPUT, self._on_policy)
@@ -70,13 +69,3 @@ class RobotAgentNode(TeamNode):
         if end.version is None and end.waiting_version is None:
             return 'waiting for a policy', values
         return 'acting' if self._taken else 'waiting for an observation', values
-
-
-def read_policy(path: Path):
-    """The policy in a file. Raises SettingsError with the reason if there is none."""
-    try:
-        return decode_policy(path.read_bytes())
-    except OSError as error:
-        raise SettingsError(f'cannot read policy_file {path}: {error.strerror}') from error
-    except Refused as refusal:
-        raise SettingsError(f'policy_file {path} is no policy: {refusal.detail}') from refusal

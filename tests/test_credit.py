@@ -138,6 +138,6 @@ def test_a_training_keeps_the_credit_of_the_watched_world_and_its_weights_do_not
 def test_a_file_that_holds_something_else_is_named(tmp_path):
     (tmp_path / 'text').write_text('nothing')
     for path, sentence in ((tmp_path / 'nowhere', 'cannot read reward_network_file .*nowhere: No such file'),
-                           (tmp_path / 'text', 'text is not a file of train_reward')):
+                           (tmp_path / 'text', 'text is no file of train_reward')):
         with pytest.raises(SettingsError, match=sentence):
             load(path)

@@ -77,9 +77,9 @@ def assert_same(one, other):
         assert one == other
 
 
-def play(request=REQUEST):
-    """All data of a rollout in the order they come about, and what each party answered to what."""
-    world, agents = WorldEnd(Drifting()), [AgentEnd(robot) for robot in range(N)]
+def play(request=REQUEST, worlds=Drifting):
+    """All data of a rollout in the order they come about, each agent answering what it is asked."""
+    world, agents = WorldEnd(worlds()), [AgentEnd(robot) for robot in range(N)]
     for agent in agents:
         agent.on_request(request)
         agent.on_policy(VERSION, POLICY)

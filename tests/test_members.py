@@ -25,7 +25,7 @@ from tests.test_learner import (  # noqa: F401
     random_trajectory,
     state_of,
 )
-from tests.test_lockstep import POLICY, REQUEST, VERSION, A, Drifting, N, W, assert_same, refused, stamped
+from tests.test_lockstep import POLICY, REQUEST, VERSION, A, Drifting, N, W, assert_same, play, refused, stamped
 
 LONG = REQUEST._replace(num_steps=24)
 
@@ -54,22 +54,7 @@ class Thinning(Drifting):
         return super()._show(episode_start)._replace(available=self._available(), present=self._here.copy())
 
 
-def play(request=LONG):
-    """All data of a rollout, each agent answering what it is asked."""
-    world, agents = WorldEnd(Thinning()), [AgentEnd(robot) for robot in range(N)]
-    for agent in agents:
-        agent.on_request(request)
-        agent.on_policy(VERSION, POLICY)
-    said, new = [], world.on_request(request)
-    while new:
-        said += new
-        actions = [agents[datum.robot].on_observation(datum) for datum in new if isinstance(datum, Observation)]
-        said += actions
-        new = [datum for action in actions for datum in world.on_action(action)]
-    return said
-
-
-DATA = play()
+DATA = play(LONG, Thinning)
 TRAJECTORY = InProcessCollector(Thinning()).collect(LONG, POLICY)
 
 

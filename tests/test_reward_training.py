@@ -175,7 +175,7 @@ def test_a_file_that_is_missing_or_something_else_is_refused(bag, tmp_path):
     with pytest.raises(SettingsError, match='cannot read reward_network.path .*: No such file'):
         run_live(tmp_path / 'run', **{'reward_network.path': str(tmp_path / 'missing')})
     (tmp_path / 'other').write_bytes(b'something else')
-    with pytest.raises(SettingsError, match='is not a file of train_reward'):
+    with pytest.raises(SettingsError, match='is no file of train_reward'):
         run_live(tmp_path / 'run2', **{'reward_network.path': str(tmp_path / 'other')})
     with pytest.raises(SettingsError, match='name it in reward_network.path'):
         run_live(tmp_path / 'run3', **{'reward_network.freeze': True})

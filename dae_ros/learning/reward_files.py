@@ -10,10 +10,10 @@ import torch
 
 from dae_ros import config
 from dae_ros.config import RewardNetworkSettings
-from dae_ros.errors import Refused, SettingsError
+from dae_ros.errors import SettingsError
 from dae_ros.learning.networks import RewardNetwork, make_reward_network
 from dae_ros.types import WorldSpec
-from dae_ros.weights.codec import decode_reward_network, encode_reward_network
+from dae_ros.weights.codec import decode_reward_network, encode_reward_network, read_file
 
 LARGEST = 2**24  # size that a file may ask for
 
@@ -41,7 +41,7 @@ def read(spec: WorldSpec, settings: RewardNetworkSettings) -> list[dict[str, np.
     if not settings.path:
         raise SettingsError('reward_network.freeze keeps the networks of a file: name it in reward_network.path')
     path = Path(settings.path)
-    tensors, found = _decoded(path, 'reward_network.path')
+    tensors, found = read_file(path, decode_reward_network, 'reward_network.path', 'file of train_reward')
     asked = _schema(spec, settings)
     different = [f'{name} is {found.get(name)!r} there and {value!r} here' for name, value in asked.items()
                  if found.get(name) != value]
@@ -53,7 +53,7 @@ def read(spec: WorldSpec, settings: RewardNetworkSettings) -> list[dict[str, np.
 
 def load(path: Path) -> RewardNetworks:
     """The networks in a file, whatever they are made for. SettingsError if it cannot be read or holds none."""
-    tensors, found = _decoded(path, 'reward_network_file')
+    tensors, found = read_file(path, decode_reward_network, 'reward_network_file', 'file of train_reward')
     members = found.pop('members', None)
     sizes = [found.pop(name, None) for name in ('num_agents', 'num_actions', 'state_size')]
     try:
@@ -70,16 +70,6 @@ def load(path: Path) -> RewardNetworks:
         network.load_state_dict({name: torch.from_numpy(tensor.copy()) for name, tensor in parameters.items()})
         networks.append(network)
     return RewardNetworks(spec, settings.recurrent, networks)
-
-
-def _decoded(path: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Tensors and schema of the file that the setting `name` names."""
-    try:
-        return decode_reward_network(path.read_bytes())
-    except OSError as error:
-        raise SettingsError(f'cannot read {name} {path}: {error.strerror}') from error
-    except Refused as refusal:
-        raise SettingsError(f'{name} {path} is not a file of train_reward: {refusal.detail}') from refusal
 
 
 def _members(path: Path, tensors: dict[str, np.ndarray], spec: WorldSpec,

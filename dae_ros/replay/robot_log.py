@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections import Counter
 from pathlib import Path
 from typing import Any, Mapping, NamedTuple
@@ -16,7 +15,7 @@ from dae_ros.errors import BagError, Refused, SettingsError
 from dae_ros.replay.bag import Bag
 from dae_ros.replay.mcap import Message
 from dae_ros.robots import standard_messages
-from dae_ros.robots.geometry import Pose
+from dae_ros.robots.geometry import Pose, check_finite
 from dae_ros.robots.motion import Command
 
 ODOMETRY, POSES = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseArray'
@@ -107,8 +106,7 @@ class RobotLog:
             self.landmarks.append((time, landmarks))
 
     def _take_pose(self, robot: int, pose: Pose) -> None:
-        if not all(map(math.isfinite, (*pose.position, pose.heading, *pose.velocity))):
-            raise Refused(Refused.NOT_FINITE, 'odometry is not finite')
+        check_finite(pose)
         if self._poses[robot] and pose.time <= self._poses[robot][-1].time:
             raise Refused(Refused.STALE, 'odometry that is not later than the one before')
         self._poses[robot].append(pose)

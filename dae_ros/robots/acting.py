@@ -6,7 +6,7 @@ import numpy as np
 
 from dae_ros.errors import Refused
 from dae_ros.learning.policy import Policy, choose
-from dae_ros.rollout.lockstep import check_run
+from dae_ros.rollout.lockstep import check_observation, check_run, respond
 from dae_ros.types import Action, Observation, Stamp
 
 
@@ -54,25 +54,17 @@ class ActingEnd:
 
     def on_observation(self, observation: Observation) -> Action | None:
         """The action that answers the observation; None while there is no policy. Raises Refused."""
-        if observation.robot != self.robot:
-            raise Refused(Refused.WRONG_ROBOT, f'observation of robot {observation.robot}, this is robot {self.robot}')
+        check_observation(observation, self.robot)
         if len(observation.values) != 1:
             raise Refused(Refused.WRONG_SHAPE, f'{len(observation.values)} worlds, a robot has 1')
-        if not np.isfinite(observation.values).all():
-            raise Refused(Refused.NOT_FINITE, 'an observation is not a finite number')
         stamp, start = observation.stamp, bool(observation.episode_start[0])
         if self._last is not None and stamp == self._last:
             raise Refused(Refused.DUPLICATE, f'{stamp.order} step {stamp.step}')
         if start or self._policy is None:
             self.activate()
-        policy = self._policy
-        if policy is None:
+        if self._policy is None:
             return None
-        if observation.values.shape[1] != policy.architecture.observation_size:
-            raise Refused(Refused.WRONG_SHAPE, f'{observation.values.shape[1]} features, the policy takes '
-                                               f'{policy.architecture.observation_size}')
+        probabilities, self._state = respond(self._policy, observation, self._state)
         self._last = stamp
-        state = policy.initial_state(1) if self._state is None else self._state
-        probabilities, self._state = policy.act(observation.values, state, observation.episode_start)
         actions = choose(probabilities, self._greedy, self._seed, stamp.rollout, stamp.step, self.robot)
         return Action(stamp, self.robot, self.version, actions, probabilities)

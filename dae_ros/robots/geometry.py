@@ -24,6 +24,12 @@ class Pose(NamedTuple):
     time: float                    # s, of the measurement
 
 
+def check_finite(pose: Pose) -> None:
+    """Refuses a pose with a value that is not a finite number."""
+    if not all(map(math.isfinite, (*pose.position, pose.heading, *pose.velocity))):
+        raise Refused(Refused.NOT_FINITE, 'odometry is not finite')
+
+
 def heading_of(x: float, y: float, z: float, w: float) -> float:
     """The heading (yaw) [rad] of a unit quaternion. Raises Refused if it is none, as one that nobody filled in."""
     norm = math.sqrt(x * x + y * y + z * z + w * w)

@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from dae_ros.errors import Refused
-from dae_ros.robots.geometry import Pose
+from dae_ros.robots.geometry import Pose, check_finite
 
 
 class Bounds(NamedTuple):
@@ -45,8 +45,7 @@ class Track:
 
     def take(self, pose: Pose, now: float) -> None:
         """Takes in a measurement; both times in s of one clock. One that cannot be right raises Refused and changes nothing."""
-        if not all(map(math.isfinite, (*pose.position, pose.heading, *pose.velocity))):
-            raise Refused(Refused.NOT_FINITE, 'odometry is not finite')
+        check_finite(pose)
         if pose.time > now + self._bounds.odometry_timeout:
             raise Refused(Refused.OUT_OF_RANGE, f'odometry from {pose.time - now:.2f} s in the future')
         last = self.pose

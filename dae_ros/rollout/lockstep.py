@@ -76,6 +76,28 @@ def check_available(available: np.ndarray | None) -> None:
         raise Refused(Refused.OUT_OF_RANGE, 'a robot has no action it may choose')
 
 
+def check_observation(observation: Observation, robot: int) -> None:
+    """Refuses an observation that `robot` cannot act on."""
+    if observation.robot != robot:
+        raise Refused(Refused.WRONG_ROBOT, f'observation of robot {observation.robot}, this is robot {robot}')
+    if not np.isfinite(observation.values).all():
+        raise Refused(Refused.NOT_FINITE, 'an observation is not a finite number')
+    check_available(observation.available)
+
+
+def respond(policy: Policy, observation: Observation, state: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """The policy's probabilities [W, A] and recurrent state [W, H], after `state`, None for nobody's. Raises Refused if the
+    observation is not what it takes."""
+    features, num_actions = policy.architecture.observation_size, policy.architecture.num_actions
+    values, available = observation.values, observation.available
+    if values.shape[1] != features:
+        raise Refused(Refused.WRONG_SHAPE, f'{values.shape[1]} features, the policy takes {features}')
+    if available is not None and available.shape[1] != num_actions:
+        raise Refused(Refused.WRONG_SHAPE, f'{available.shape[1]} actions, the policy has {num_actions}')
+    state = policy.initial_state(len(values)) if state is None else state
+    return policy.act(values, state, observation.episode_start, available)
+
+
 class WorldEnd:
     """Steps one group's batch of worlds through the rollouts it is asked for.
 
@@ -208,11 +230,7 @@ class AgentEnd:
         """The action that answers the observation, or None while the request or the policy it needs is on its way."""
         stamp = observation.stamp
         check_run(stamp.run, self.run)
-        if observation.robot != self.robot:
-            raise Refused(Refused.WRONG_ROBOT, f'observation of robot {observation.robot}, this is robot {self.robot}')
-        if not np.isfinite(observation.values).all():
-            raise Refused(Refused.NOT_FINITE, 'an observation is not a finite number')
-        check_available(observation.available)
+        check_observation(observation, self.robot)
         request = self.request
         if request is None or stamp.order > request.order:
             self._early = observation
@@ -237,15 +255,7 @@ class AgentEnd:
         if pending is None or pending.policy_version not in self._policies:
             return None
         self._pending = None
-        policy = self._policies[pending.policy_version]
-        if pending.values.shape[1] != policy.architecture.observation_size:
-            raise Refused(Refused.WRONG_SHAPE, f'{pending.values.shape[1]} features, the policy takes '
-                                               f'{policy.architecture.observation_size}')
-        if pending.available is not None and pending.available.shape[1] != policy.architecture.num_actions:
-            raise Refused(Refused.WRONG_SHAPE, f'{pending.available.shape[1]} actions, the policy has '
-                                               f'{policy.architecture.num_actions}')
-        state = policy.initial_state(len(pending.values)) if self._state is None else self._state
-        probabilities, self._state = policy.act(pending.values, state, pending.episode_start, pending.available)
+        probabilities, self._state = respond(self._policies[pending.policy_version], pending, self._state)
         seed = draws.group_seed(request.seed, self._group)
         actions = choose(probabilities, request.greedy, seed, request.rollout, pending.stamp.step, self.robot)
         self._next_step = pending.stamp.step + 1

@@ -8,13 +8,14 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from typing import Any, Mapping
+from pathlib import Path
+from typing import Any, Callable, Mapping, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from dae_ros.errors import Refused
+from dae_ros.errors import Refused, SettingsError
 from dae_ros.learning.policy import Policy, PolicyArchitecture
 from dae_ros.types import PolicyWeights
 from dae_ros.weights.signing import check_signature, sign
@@ -24,6 +25,7 @@ CHECKPOINT_FORMAT = 'dae_ros.checkpoint/1'
 REWARD_NETWORK_FORMAT = 'dae_ros.reward_network/1'
 MAX_POLICY_BYTES = 64 * 2**20
 _HEADER_LENGTH = struct.Struct('<Q')
+_Decoded = TypeVar('_Decoded')
 
 
 def sha256(data: bytes) -> str:
@@ -39,6 +41,16 @@ def tensors_sha256(tensors: Mapping[str, np.ndarray]) -> str:
         digest.update(f'{name} {tensor.dtype.str} {tensor.shape}\n'.encode())
         digest.update(tensor.tobytes())
     return digest.hexdigest()
+
+
+def read_file(path: Path, decode: Callable[[bytes], _Decoded], name: str, kind: str) -> _Decoded:
+    """What `decode` makes of a file. SettingsError if it cannot be read or is no `kind`; `name` says who wanted it."""
+    try:
+        return decode(path.read_bytes())
+    except OSError as error:
+        raise SettingsError(f'cannot read {name} {path}: {error.strerror}') from error
+    except Refused as refusal:
+        raise SettingsError(f'{name} {path} is no {kind}: {refusal.detail}') from refusal
 
 
 def encode_policy(policy: Policy) -> bytes:
