@@ -78,8 +78,12 @@ def reproduce(chosen: list[Figure], workers: int, records: Records, docs: Path) 
             write_results(chosen, records, docs)
             drawn_at = time.monotonic()
 
-    todo = schedule.jobs([run for figure in chosen for run in figure.all_runs()], records)
+    playable = [figure for figure in chosen if figure.is_playable]
+    todo = schedule.jobs([run for figure in playable for run in figure.all_runs()], records)
     with Progress() as progress:
+        if len(playable) < len(chosen):
+            left_out = ', '.join(figure.name for figure in chosen if figure not in playable)
+            progress.note(f'left out: figures {left_out}, which need JaxMARL; `make smax` installs it')
         progress.note(f'{len(todo)} runs to train in {records.folder}')
         try:
             failed = schedule.train(todo, workers, records, progress, refresh)

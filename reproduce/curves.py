@@ -17,7 +17,7 @@ from reproduce.statistics import binned, mean_and_interval
 
 POINTS = 100  # bins of a run, at least; at most twice as many
 SPENT = ('seconds/collecting', 'seconds/learning')
-COLUMNS = {'mean_return': 'mean_return', 'advantage/deviation': 'advantage_deviation',
+COLUMNS = {'mean_return': 'mean_return', 'win_rate': 'win_rate', 'advantage/deviation': 'advantage_deviation',
            'reward_network/explained_variance': 'reward_explained_variance', 'policy/entropy': 'policy_entropy',
            'expected_reward/explained': 'expected_reward_explained', 'credit/explained': 'credit_explained', SECONDS: 'seconds'}
 PROBED = {'expected_reward/explained': 'explained', 'credit/explained': 'credit_explained'}  # in what the runs log of it

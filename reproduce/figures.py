@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Mapping
 
@@ -14,6 +15,7 @@ from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.errors import SettingsError
 from dae_ros.report.metrics import STEPS
+from dae_ros.worlds import smax
 
 FOLDER = ROOT / 'config' / 'figures'
 # One thread each: side by side, runs use the cores better than a learner's threads do.
@@ -21,7 +23,8 @@ EVERY_RUN = {'device': 'cpu', 'learner_threads': 1}
 SECONDS = 'seconds'
 EXACT = 'exact'  # true among a curve's settings: its runs are told the simulator's E[r]
 PRETRAINED = 'pretrained'  # among them too: steps of a team that has learnt nothing, from which its reward networks learn first
-METRICS = {'mean_return': 'mean return of an episode', 'advantage/deviation': 'standard deviation of the advantages',
+METRICS = {'mean_return': 'mean return of an episode', 'win_rate': 'share of the episodes won',
+           'advantage/deviation': 'standard deviation of the advantages',
            'reward_network/explained_variance': 'variance of the reward explained',
            'expected_reward/explained': 'variance of E[r] explained', 'credit/explained': 'credit explained',
            STEPS: 'environment steps', SECONDS: 'seconds of training, in one thread'}
@@ -61,7 +64,7 @@ class Run:
 class Team:
     """A task with a team size, and how long and how often it is trained."""
 
-    task: str  # the name of its task file
+    task: str  # its task file below config/, without the suffix
     num_agents: int
     seeds: int
     steps: int
@@ -93,6 +96,12 @@ class Figure:
     def tasks(self) -> list[str]:
         return list(dict.fromkeys(team.task for team in self.teams))
 
+    @property
+    def is_playable(self) -> bool:
+        """Whether what its tasks need beside this package is installed."""
+        plays_smax = any(_task_file(team.task)['task'].startswith(smax.PREFIX) for team in self.teams)
+        return not plays_smax or find_spec('jaxmarl') is not None
+
     def sizes(self, task: str) -> list[Team]:
         """The teams of one task."""
         return [team for team in self.teams if team.task == task]
@@ -110,7 +119,7 @@ class Figure:
         # Named after its settings, not after a figure or a curve, so that figures share it.
         different = ''.join(f'_{name}-{_text(config.flatten(settings)[name])}' for name in sorted(changes))
         different += f'_{EXACT}' if exact else f'_{PRETRAINED}-{pretrained}' if pretrained else ''
-        return Run(f'{team.task}_n{team.num_agents}{different}_seed{seed}', settings, exact,
+        return Run(f'{Path(team.task).name}_n{team.num_agents}{different}_seed{seed}', settings, exact,
                    min(pretrained, SHORT_PRETRAINING) if self.short else pretrained)
 
     def runs(self, team: Team, curve: str) -> list[Run]:

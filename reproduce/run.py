@@ -74,7 +74,8 @@ def _train(path: Path, settings: Settings, stopping: Callable[[], bool], exact: 
     recorder = AlternativesRecorder(worlds) if exact else None
     training = Training(settings, worlds.spec, RunFolder(path, settings), recorder and recorder.expected_rewards)
     learns_reward = settings.learner.estimator == 'dae' and settings.learner.beta > 0 and not exact
-    credit = CreditLog(path / 'credit', training, worlds) if learns_reward else None
+    knows_truth = isinstance(worlds, SynchronousWorlds)
+    credit = CreditLog(path / 'credit', training, worlds) if learns_reward and knows_truth else None
 
     def on_update() -> None:
         if credit is not None:
@@ -131,10 +132,11 @@ def _but_for_length(settings: Settings) -> Settings:
 
 
 def _result(training: Training) -> Mapping[str, Any]:
-    returns = training.evaluation
+    returns, won = training.evaluation, training.won
     return {'environment_steps': training.environment_steps, 'seconds': training.seconds,
             'steps_per_second': training.environment_steps / training.seconds,
             'evaluation_return': float(returns.mean()) if len(returns) else None, 'evaluation_episodes': len(returns),
+            'evaluation_win_rate': float(won.mean()) if len(won) and training.spec.has_wins else None,
             'weights_sha256': training.weights_sha256()}
 
 

@@ -79,7 +79,8 @@ def _results(curves: Curves, records: Records) -> str:
             longer = curves.longer[teams[0], curve] if len(teams) == 1 else None
             if longer is not None:
                 rows.append(_row(curves, records, task, teams, curve, [[longer]], f'seed {longer.run.seed} alone'))
-    head = ['task', 'N', 'curve', 'seeds', 'steps', f'{METRICS[figure.shows]}, last 5 %', 'return at the end, greedy']
+    head = ['task', 'N', 'curve', 'seeds', 'steps', f'{METRICS[figure.shows]}, last 5 %',
+            f'{_evaluated(curves)[0]} at the end, greedy']
     return _table(head, rows)
 
 
@@ -88,7 +89,7 @@ def _row(curves: Curves, records: Records, task: str, teams: Sequence[Team], cur
     """One curve's numbers at the end of training, over the seeds of each team."""
     return [task, _sizes(teams), curve, seeds, f'{groups[0][0].run.steps:,}',
             _number(*_interval(groups, lambda seed: last(seed.metrics[curves.figure.shows]))),
-            _number(*_interval(groups, lambda seed: _evaluation(seed, records)))]
+            _number(*_interval(groups, lambda seed: _evaluation(seed, records, _evaluated(curves)[1])))]
 
 
 def _thresholds(curves: Curves) -> str:
@@ -130,9 +131,14 @@ def _interval(groups: Sequence[Sequence[Seed]], value) -> tuple[float, float]:
     return mean_and_interval([np.array([value(seed) for seed in group]) for group in groups])
 
 
-def _evaluation(seed: Seed, records: Records) -> float:
+def _evaluated(curves: Curves) -> tuple[str, str]:
+    """What the trained teams' evaluation tells: what people call it, and its name among a run's facts."""
+    return ('share won', 'evaluation_win_rate') if curves.figure.shows == 'win_rate' else ('return', 'evaluation_return')
+
+
+def _evaluation(seed: Seed, records: Records, name: str) -> float:
     facts = records.facts(seed.run)
-    found = None if facts is None else facts['evaluation_return']
+    found = None if facts is None else facts[name]
     return np.nan if found is None else found
 
 

@@ -377,6 +377,9 @@ def test_every_figure_is_trained_drawn_and_tabled_in_its_short_mode(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     text = (tmp_path / 'docs/results.md').read_text()
     for figure in figures.load(NAMES, short=True):
+        if not figure.is_playable:
+            assert figure.name in done.stdout.split('left out: figures ')[1].splitlines()[0]
+            continue
         assert f'<!-- generated: figure {figure.name} -->' in text
         assert (tmp_path / f'docs/results/{figure.name}.png').read_bytes().startswith(b'\x89PNG')
         rows = list(csv.DictReader(open(tmp_path / f'docs/results/{figure.name}.csv', encoding='utf-8')))

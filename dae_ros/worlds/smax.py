@@ -132,7 +132,8 @@ def _programs(environment: Any, num_worlds: int) -> tuple[Any, Any]:
 
     def begin(keys: Any) -> tuple[Shown, Any]:
         observed, battle = environment.reset(keys[1])
-        return show(observed, battle), battle
+        # Of the types that `step` gives, lest it is compiled once for first battles and once for others: neither is weak then.
+        return jax.tree.map(lambda leaf: leaf.astype(leaf.dtype), (show(observed, battle), battle))
 
     def step(keys: Any, battle: Any, actions: Any) -> tuple[tuple, Shown, Any]:
         actions = jnp.where(battle.state.unit_alive[:N], actions, stop)
@@ -142,7 +143,8 @@ def _programs(environment: Any, num_worlds: int) -> tuple[Any, Any]:
         ended = ended['__all__']
         outcome = rewards[agents[0]], ended, ended & ~won & ~lost, won & ~lost, observed['world_state']
         fresh = begin(keys)
-        shown, battle = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, (show(observed, battle), battle))
+        shown, battle = jax.tree.map(lambda new, old: jnp.where(ended, new, old).astype(new.dtype), fresh,
+                                     (show(observed, battle), battle))
         return outcome, shown, battle
 
     return jax.jit(jax.vmap(begin)), jax.jit(jax.vmap(step))
