@@ -113,7 +113,7 @@ def test_a_wrong_declaration_is_named(tmp_path, before, after, words):
 
 
 def test_a_figure_that_is_not_declared_is_named():
-    with pytest.raises(SettingsError, match='there is no figure 9; there are delayed, delayed-reward, 1b, '):
+    with pytest.raises(SettingsError, match='there is no figure 9; there are 3, 4-battles, 6, delayed, '):
         figures.load(['9'])
 
 
