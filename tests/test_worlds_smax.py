@@ -86,7 +86,7 @@ def test_battles_are_those_that_jaxmarl_plays_by_itself(jaxmarl):
                 chosen = {agent: action if before.present[world, unit] else 4
                           for unit, (agent, action) in enumerate(zip(alone.agents, actions[world]))}
                 observed, states[world], rewards, ended, _ = play(keys[world, 0], states[world], chosen)
-                assert transition.reward[world] == pytest.approx(float(rewards['ally_0']), abs=1e-5)
+                assert transition.reward[world] == pytest.approx(10 * float(rewards['ally_0']), abs=1e-4)
                 alive = np.asarray(states[world].state.unit_alive)
                 won, lost = not alive[5:].any(), not alive[:5].any()
                 begins = bool(ended['__all__'])

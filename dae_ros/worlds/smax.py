@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from dae_ros.types import WorldSpec
 from dae_ros.worlds.base import JointObservation, Transition, Worlds, check_actions
 
 PREFIX = 'smax:'
+REWARD_SCALE = 10.0  # to JaxMARL's
 
 _MARINE, _MARAUDER, _STALKER, _ZEALOT, _ZERGLING, _HYDRALISK = range(6)
 # Maps of the paper that JaxMARL does not have, as far as its units allow: allies, enemies.
@@ -42,7 +44,8 @@ class SmaxWorlds(Worlds):
     """W battles of the task `smax:MAP` against JaxMARL's heuristic enemies.
 
     - A fallen unit has left the team; its action is JaxMARL's `stop`. The others' actions are JaxMARL's, in its order.
-    - The reward is JaxMARL's: the share of the enemies' health taken, and 1 for a victory.
+    - The reward is JaxMARL's, the share of the enemies' health taken and 1 for a victory, times 10: a victory is worth 20 in
+      all, as in SMAC, for which the paper's settings of the reward network, which learns raw rewards, were made.
     - A battle that lasts `episode_steps` (0: JaxMARL's 100) is truncated; one that a side has lost is terminated.
     - Everything random in a step of a rollout comes from JAX keys drawn for it, a pair for each world.
     """
@@ -50,9 +53,9 @@ class SmaxWorlds(Worlds):
     def __init__(self, task: TaskSettings):
         if task.observe_others or task.reward_delay:
             raise SettingsError(f'observe_others and reward_delay do not belong to {task.task}')
-        self._environment = _make(task)
+        self._map = task.task, task.episode_steps
         self.num_worlds = task.num_worlds
-        environment = self._environment
+        environment = _environment(*self._map)
         if environment.num_agents != task.num_agents:
             raise SettingsError(f'{task.task} has {environment.num_agents} units; set num_agents to {environment.num_agents}')
         self.spec = WorldSpec(environment.num_agents, environment.num_ally_actions, environment.obs_size, environment.state_size,
@@ -64,7 +67,7 @@ class SmaxWorlds(Worlds):
 
     def reset(self, seed: int, rollout: int) -> JointObservation:
         if self._programs is None:  # compiled where they are needed: who only wants the sizes need not wait
-            self._programs = _programs(self._environment, self.num_worlds)
+            self._programs = _programs(*self._map)
         self._rollout_key, self._steps = (seed, rollout), 0
         shown, self._battles = self._programs[0](self._keys())
         return _joint_observation(shown, np.ones(self.num_worlds, bool))
@@ -90,16 +93,17 @@ def _joint_observation(shown: Shown, episode_start: np.ndarray) -> JointObservat
     return JointObservation(observations, state, episode_start, available, alive)
 
 
-def _make(task: TaskSettings) -> Any:
+@lru_cache(maxsize=None)
+def _environment(task: str, episode_steps: int) -> Any:
     """JaxMARL's environment of the task's map."""
-    name = task.task.removeprefix(PREFIX)
+    name = task.removeprefix(PREFIX)
     os.environ.setdefault('JAX_PLATFORMS', 'cpu')
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it greets
             import jax.numpy as jnp
             from jaxmarl.environments.smax import HeuristicEnemySMAX, Scenario, map_name_to_scenario
     except ImportError as error:
-        raise WorldError(f'{task.task} needs JaxMARL ({error}); `make smax` installs it, with CPython 3.11 or newer') from error
+        raise WorldError(f'{task} needs JaxMARL ({error}); `make smax` installs it, with CPython 3.11 or newer') from error
     if name in OWN_MAPS:
         allies, enemies = OWN_MAPS[name]
         scenario = Scenario(jnp.array(allies + enemies, jnp.uint8), len(allies), len(enemies), False, False)
@@ -110,15 +114,17 @@ def _make(task: TaskSettings) -> Any:
             also = '; 1c3s5z needs a colossus, which SMAX has not' if name == '1c3s5z' else ''
             raise SettingsError(f'SMAX has no map {name!r}; there are those of JaxMARL, such as 2s3z, and '
                                 f'{", ".join(OWN_MAPS)}{also}') from error
-    limit = {'max_steps': task.episode_steps} if task.episode_steps else {}
+    limit = {'max_steps': episode_steps} if episode_steps else {}
     return HeuristicEnemySMAX(scenario=scenario, **limit)
 
 
-def _programs(environment: Any, num_worlds: int) -> tuple[Any, Any]:
+@lru_cache(maxsize=None)  # worlds of equal sizes need not wait for the compiler again
+def _programs(task: str, episode_steps: int) -> tuple[Any, Any]:
     """Compiled programs: keys [W, 2, 2] to first battles, and keys, battles and actions [W, N] to what comes after."""
     import jax
     import jax.numpy as jnp
 
+    environment = _environment(task, episode_steps)
     stop = environment.num_movement_actions - 1
     agents, N = environment.agents, environment.num_agents
 
@@ -141,7 +147,7 @@ def _programs(environment: Any, num_worlds: int) -> tuple[Any, Any]:
         alive = battle.state.unit_alive
         won, lost = ~alive[N:].any(), ~alive[:N].any()
         ended = ended['__all__']
-        outcome = rewards[agents[0]], ended, ended & ~won & ~lost, won & ~lost, observed['world_state']
+        outcome = REWARD_SCALE * rewards[agents[0]], ended, ended & ~won & ~lost, won & ~lost, observed['world_state']
         fresh = begin(keys)
         shown, battle = jax.tree.map(lambda new, old: jnp.where(ended, new, old).astype(new.dtype), fresh,
                                      (show(observed, battle), battle))

@@ -94,9 +94,9 @@ def bringup(folder: Path, values: dict, *arguments: str) -> subprocess.Popen:
                             preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL))
 
 
-def finish(process: subprocess.Popen) -> tuple[int, str, str]:
-    """Exit code, output and errors of a command that ends by itself."""
-    output, errors = process.communicate(timeout=TIMEOUT)
+def finish(process: subprocess.Popen, timeout: float = TIMEOUT) -> tuple[int, str, str]:
+    """Exit code, output and errors of a command that ends by itself, within so many seconds."""
+    output, errors = process.communicate(timeout=timeout)
     return process.returncode, output, errors
 
 
