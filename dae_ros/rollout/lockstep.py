@@ -58,13 +58,14 @@ def check_action(action: Action, num_agents: int, num_worlds: int, num_actions: 
     if action.probabilities.shape != expected or action.actions.shape != (num_worlds,):
         raise Refused(Refused.WRONG_SHAPE, f'{action.probabilities.shape} probabilities and {action.actions.shape} actions, '
                                            f'expected {expected} and {expected[:1]}')
-    if not np.isfinite(action.probabilities).all():
+    least, most = action.probabilities.min(), action.probabilities.max()
+    if not (np.isfinite(least) and np.isfinite(most)):  # nan is least and most of what it is among
         raise Refused(Refused.NOT_FINITE, 'a probability is not a finite number')
-    if (action.probabilities < 0).any() or (np.abs(action.probabilities.sum(1) - 1) > PROBABILITY_SUM_TOLERANCE).any():
+    if least < 0 or np.abs(action.probabilities.sum(1) - 1).max() > PROBABILITY_SUM_TOLERANCE:
         raise Refused(Refused.OUT_OF_RANGE, 'probabilities do not sum to 1')
-    if (action.actions >= num_actions).any():
+    if action.actions.max() >= num_actions:
         raise Refused(Refused.OUT_OF_RANGE, f'action {action.actions.max()} of {num_actions}')
-    if (action.probabilities[np.arange(num_worlds), action.actions] <= 0).any():
+    if action.probabilities[np.arange(num_worlds), action.actions].min() <= 0:
         raise Refused(Refused.OUT_OF_RANGE, 'an action was chosen that has probability 0')
     if available is not None and action.probabilities[~available].any():
         raise Refused(Refused.OUT_OF_RANGE, 'an action that is not available has a probability')
