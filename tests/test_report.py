@@ -142,6 +142,11 @@ def test_a_summary_comes_back_from_its_file_as_it_was(summary, tmp_path):
     assert json.loads((tmp_path / 'summary.json').read_text())['weights_sha256'] == 'ab' * 32
 
 
+def test_the_last_lines_tell_how_many_battles_were_won():
+    assert 'fresh episodes, 94% won' in dataclasses.replace(SUMMARY, evaluation_win_rate=0.9375).lines()
+    assert 'won' not in SUMMARY.lines()
+
+
 def test_the_last_lines_show_the_trained_team_between_the_yardsticks():
     lines = SUMMARY.lines().splitlines()
     order = [line.split()[0] for line in lines if '±' in line]

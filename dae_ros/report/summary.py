@@ -28,6 +28,7 @@ class Summary:
     evaluation_episodes: int
     yardsticks: dict[str, list[float]]  # mean return and standard error of teams that learnt nothing
     weights_sha256: str
+    evaluation_win_rate: float | None = None  # of tasks that are won or lost
 
     def write(self, path: Path) -> None:
         """Writes the summary as JSON."""
@@ -45,7 +46,8 @@ class Summary:
                  f'{self.steps_per_second:,.0f} steps per second']
         teams = {name: (mean, error, '') for name, (mean, error) in self.yardsticks.items()}
         if self.evaluation_return is not None:
-            episodes = f'   {self.policy}, {self.evaluation_episodes} fresh episodes'
+            won = '' if self.evaluation_win_rate is None else f', {self.evaluation_win_rate:.0%} won'
+            episodes = f'   {self.policy}, {self.evaluation_episodes} fresh episodes{won}'
             teams['trained team'] = (self.evaluation_return, self.evaluation_standard_error, episodes)
         facts.append('mean return')
         for name, (mean, error, remark) in sorted(teams.items(), key=lambda team: team[1][0]):
