@@ -56,13 +56,12 @@ def epoch(network: networks.Network, rows: int, inputs: int, spec: WorldSpec, ch
     """Gradients of all shards of one pass over the batch."""
     def shard(C: int) -> tuple:
         L, N = length, spec.num_agents
-        actions, weights = torch.randint(spec.num_actions, (L, C, N)), torch.full((L, C), 1 / (L * C))
-        per_agent = torch.randn(2, L, C, N)
-        per_world = torch.randn(2, L, C)
+        actions, weights = torch.randint(spec.num_actions, (L, C, N)), torch.full((L, C, N), 1 / (L * C * N))
+        per_agent, per_world = torch.randn(2, L, C, N), torch.randn(2, L, C, 1)
         if isinstance(network, networks.RewardNetwork):
-            loss = losses.RewardLoss(actions, per_world[0], weights)
+            loss = losses.RewardLoss(actions, per_world[0, ..., 0], weights)
         elif rows == 1:
-            loss = losses.ValueLoss(*per_world, weights, 0.2, 10.0, 1.0)
+            loss = losses.ValueLoss(*per_world, N * weights[..., :1], 0.2, 10.0, 1.0)
         else:
             loss = losses.PolicyLoss(actions, *per_agent, weights, 0.2, 0.01)
         states = network.states_per_world() if isinstance(network, networks.RewardNetwork) else rows

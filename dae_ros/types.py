@@ -21,6 +21,12 @@ class WorldSpec(NamedTuple):
     state_size: int          # S
     state_is_observations: bool  # the state is the N observations one after another (S = N * O)
     has_wins: bool = False       # episodes are won or lost
+    states_per_agent: bool = False  # the state is the agents' own states one after another; each is valued by its own
+
+    @property
+    def num_values(self) -> int:
+        """How many states the critic values in a world, each of `state_size // num_values` features."""
+        return self.num_agents if self.states_per_agent else 1
 
 
 class Order(NamedTuple):

@@ -66,7 +66,7 @@ def test_filling_of_weight_0_changes_neither_loss_nor_gradient(length):
 
     def loss(cut):
         value_loss = losses.ValueLoss(cut(old_values), cut(targets), cut(weights), 0.2, 10.0, 0.5)
-        return value_loss(cut(values)[..., None, None])
+        return value_loss(cut(values)[..., None])
 
     (cut, cut_sums), (whole, whole_sums) = loss(lambda part: to_chunks(part, length)), loss(lambda part: part)
     torch.testing.assert_close((cut, cut_sums), (whole, whole_sums))

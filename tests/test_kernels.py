@@ -109,7 +109,7 @@ def policy_loss(outputs, bonus=0.3, masked=False):
 
 def value_loss(outputs):
     """Of values within the clip range and out of it, with errors within delta and beyond."""
-    values = outputs.flatten(1)
+    values = outputs.squeeze(-1)
     old = values + one_of([-0.7, -0.1, 0.0, 0.05, 0.6], *values.shape, seed=4)
     targets = values + one_of([-3.0, -0.4, 0.3, 2.5], *values.shape, seed=5) + 0.03 * uniform(*values.shape)
     return losses.ValueLoss(old.float(), targets.float(), some_weights(*values.shape), 0.2, 1.0, 0.5)
@@ -226,9 +226,10 @@ def test_any_row_of_steps_and_its_gradients_equal_torch_in_double_precision(kind
 @pytest.mark.parametrize('kind', ['linear', 'linear, tanh', 'GRU', 'layer, GRU, layer'])
 def test_the_value_loss_of_a_row_of_steps_equals_torch_in_double_precision(kind, sizes):
     L, C, I = sizes
-    network, batch, outputs = clear_of_jumps(lambda seed: row_of_steps(kind, L, C, 1, I, 1, seed=seed))
-    assert outputs.shape == (L, C, 1, 1)
-    assert_exact_to_rounding(network, batch, value_loss(outputs))
+    for rows in (1, 3):  # the team's value, or each agent's
+        network, batch, outputs = clear_of_jumps(lambda seed: row_of_steps(kind, L, C, rows, I, 1, seed=seed))
+        assert outputs.shape == (L, C, rows, 1)
+        assert_exact_to_rounding(network, batch, value_loss(outputs))
 
 
 @native
@@ -236,9 +237,10 @@ def test_a_value_within_the_clip_range_always_moves_however_the_difference_from_
     network = with_random_parameters(Row((layer, Linear(3, 1, bias=False))))
     batch = batch_for(network, 10, 400, 1, 3, 1)
     batch = batch._replace(inputs=0.05 * batch.inputs)
-    values = exact_outputs(network, batch)[0].flatten(1)
-    old, targets = values + 0.19 * (2 * uniform(10, 400) - 1), values + randoms(10, 400)
-    assert_exact_to_rounding(network, batch, losses.ValueLoss(old.float(), targets.float(), torch.ones(10, 400), 0.2, 1.0, 0.5))
+    values = exact_outputs(network, batch)[0].squeeze(-1)
+    old, targets = values + 0.19 * (2 * uniform(10, 400, 1) - 1), values + randoms(10, 400, 1)
+    loss = losses.ValueLoss(old.float(), targets.float(), torch.ones(10, 400, 1), 0.2, 1.0, 0.5)
+    assert_exact_to_rounding(network, batch, loss)
 
 
 def recurrent_network(activation, layers, L, C, rows, outputs, seed=0):
@@ -402,8 +404,8 @@ def test_what_a_column_gives_does_not_depend_on_the_columns_beside_it(all_exampl
 def test_the_gradient_is_that_of_the_very_outputs_the_forward_pass_gives():
     network, batch = recurrent_network('relu', 2, 9, 101, 1, 1)
     with torch.no_grad():
-        values = network(*batch)[0].flatten(1)
-    gradient, sums = network.gradient(losses.ValueLoss(values, values, torch.ones(9, 101), 0.2, 1.0, 1.0), *batch)
+        values = network(*batch)[0].squeeze(-1)
+    gradient, sums = network.gradient(losses.ValueLoss(values, values, torch.ones(9, 101, 1), 0.2, 1.0, 1.0), *batch)
     assert not gradient.any() and not sums.any()
 
 

@@ -161,7 +161,7 @@ def losses_of(columns):
     parts = logits, actions, *random.normal(size=(3, L, 8, N)), *random.normal(size=(3, L, 8))
     logits, actions, old, advantages, weights, values, old_values, targets = (part[:, columns] for part in tensors(*parts))
     found = [losses.PolicyLoss(actions, old, advantages, weights, 0.2, 0.3)(logits),
-             losses.ValueLoss(old_values, targets, weights[..., 0], 0.2, 1.0, 0.5)(values[..., None, None]),
+             losses.ValueLoss(old_values, targets, weights[..., 0], 0.2, 1.0, 0.5)(values[..., None]),
              losses.RewardLoss(actions, targets, weights)(logits)]
     return torch.cat([torch.cat([differentiated.view(1), sums]) for differentiated, sums in found])
 

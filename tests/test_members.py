@@ -202,3 +202,71 @@ def test_masks_that_mask_nothing_change_an_update_by_rounding_at_most(make_learn
         after.append(parameters(state_of(made), 'actor'))
     for name, values in after[0].items():
         np.testing.assert_allclose(values, after[1][name], atol=1e-6, err_msg=name)
+
+
+# Values of each agent's own state.
+
+OWN = SPEC._replace(state_size=3 * 7, states_per_agent=True)
+PLAIN_MAPPO = replace(LEARNER, beta=0.0)
+
+
+def updated(make_learner, spec, data, settings=PLAIN_MAPPO):  # noqa: F811
+    """The state of a learner after one update."""
+    learner = make_learner(settings, spec=spec)
+    metrics = learner.update(data, 0)
+    return state_of(learner), metrics
+
+
+def with_own_states(data, change=lambda states: states):
+    """The rollout with a copy of the state for each agent, changed [..., N, S]."""
+    copies = [change(np.repeat(states[..., None, :], 3, axis=-2)) for states in (data.states, data.final_states)]
+    return data._replace(states=copies[0].reshape(*data.states.shape[:2], -1), final_states=copies[1].reshape(-1, 3 * 7))
+
+
+def test_agents_that_all_have_the_teams_state_are_valued_as_the_team_is(make_learner):  # noqa: F811
+    data = random_trajectory(steps=12)
+    team, team_metrics = updated(make_learner, SPEC, data)
+    own, own_metrics = updated(make_learner, OWN, with_own_states(data))
+    assert own.keys() == team.keys() and own_metrics.keys() == team_metrics.keys()
+    for name in team:
+        np.testing.assert_allclose(own[name], team[name], rtol=1e-3, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize('beta', [0.0, 0.9])
+def test_an_agents_advantages_depend_on_its_own_state_and_not_on_that_of_another(beta, make_learner):  # noqa: F811
+    def estimated(data):
+        learner = make_learner(replace(LEARNER, beta=beta), spec=OWN)
+        return learner._estimator.estimate(learner._tensors(data), 0).advantages.numpy().copy()
+
+    def other(states):
+        states = states.copy()
+        states[..., 2, :] += 1.0
+        return states
+
+    data = random_trajectory(steps=12)
+    before, after = estimated(with_own_states(data)), estimated(with_own_states(data, other))
+    assert not np.array_equal(before[..., 2], after[..., 2])
+    if beta == 0:  # with credit, the reward network sees the states of all
+        np.testing.assert_array_equal(before[..., :2], after[..., :2])
+
+
+def test_what_is_said_of_the_own_state_of_one_who_has_left_changes_no_weight(make_learner):  # noqa: F811
+    data = random_trajectory(steps=12)
+    present = np.ones(data.actions.shape, bool)
+    left = np.zeros(len(data.states) - 1, bool)
+    left[5:] = True
+    ended = np.cumsum(data.episode_start[:-1], axis=0)
+    present[..., 1] = ~(left[:, None] & (ended == ended[5]))
+    data = data._replace(present=present)
+    gone = np.concatenate([~present[..., 1], np.zeros((1, present.shape[1]), bool)])
+
+    def perturbed(states):
+        states = states.copy()
+        if states.shape[:2] == gone.shape:
+            states[gone, 1] += 7.0
+        return states
+
+    assert gone.any()
+    quiet, loud = (updated(make_learner, OWN, with_own_states(data, change))[0]
+                   for change in (lambda states: states, perturbed))
+    assert_same_bits(quiet, loud)

@@ -13,6 +13,7 @@ from pettingzoo import ParallelEnv
 from dae_ros import draws
 from dae_ros.config import TaskSettings
 from dae_ros.errors import SettingsError, WorldError
+from dae_ros.types import WorldSpec
 from dae_ros.worlds import make_worlds, world_spec
 
 
@@ -80,7 +81,7 @@ def no_actions(worlds):
 
 def test_an_environment_of_mpe2_runs_as_it_does_by_itself():
     worlds = spread(num_agents=4, episode_steps=5)
-    assert worlds.spec == (4, 5, 24, 96, False, False)
+    assert worlds.spec == WorldSpec(4, 5, 24, 96, state_is_observations=False)
     environment = simple_spread_v3.parallel_env(N=4, max_cycles=5)
     joint = worlds.reset(seed=7, rollout=2)
     seen, _ = environment.reset(seed=draws.key(7, 'reset', 2, 0, 1) % 2**31)
@@ -123,7 +124,7 @@ def test_an_environment_of_butterfly_with_images_plugs_in():
 
 def test_short_observations_are_padded_and_make_the_state_where_there_is_none(tiny):
     worlds = tiny()
-    assert worlds.spec == (2, 3, 3, 6, True, False)
+    assert worlds.spec == WorldSpec(2, 3, 3, 6, state_is_observations=True)
     joint = worlds.reset(seed=1, rollout=0)
     assert joint.observations[:, 0, :2].all() and joint.observations[:, 1].all()
     assert not joint.observations[:, 0, 2].any()
@@ -247,6 +248,33 @@ def test_members_that_leave_before_the_others_are_absent_until_the_last_one_ends
         assert transition.reward.tolist() == [0.5 if step % 4 in (3, 0) else 1.5]
     taken = worlds._environments[0].taken
     assert [sorted(actions) for actions in taken] == 2 * [['left', 'right'], ['left', 'right'], ['left'], ['left']]
+
+
+def own_states(team):
+    """The states of a `TinyTeam`'s agents: who, and how many steps there were."""
+    return {agent: {'state': np.array([number, team.steps])} for number, agent in enumerate(team.possible_agents)}
+
+
+def test_states_of_each_agent_are_put_one_after_another_and_are_zeros_for_one_that_has_left(tiny):
+    def with_states(act):
+        return lambda team, *arguments, **named: (*act(team, *arguments, **named)[:-1], own_states(team))
+
+    worlds = tiny(num_worlds=1, ends={'terminations': (1, 3), 'truncations': (9, 9)}, reset=with_states(TinyTeam.reset),
+                  step=with_states(TinyTeam.step))
+    assert (worlds.spec.state_size, worlds.spec.states_per_agent, worlds.spec.num_values) == (4, True, 2)
+    assert worlds.reset(1, 0).state.tolist() == [[0, 0, 1, 0]]
+    assert worlds.step(np.zeros((1, 2), np.int64)).next.state.tolist() == [[0, 0, 1, 1]]  # left has left
+    assert worlds.step(np.zeros((1, 2), np.int64)).next.state.tolist() == [[0, 0, 1, 2]]
+    assert worlds.step(np.zeros((1, 2), np.int64)).next.state.tolist() == [[0, 0, 1, 0]]  # all are there again
+
+
+def test_states_that_only_some_agents_have_are_refused(tiny):
+    def reset(team, seed=None, options=None):
+        seen, _ = TinyTeam.reset(team)
+        return seen, {'left': {'state': [1.0]}}
+
+    with pytest.raises(WorldError, match='do not all have states of the same size'):
+        tiny(reset=reset)
 
 
 def test_an_end_of_the_last_agents_that_terminates_not_all_of_them_is_cut_off(tiny):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 def generalized_advantages(rewards: Tensor, values: Tensor, next_values: Tensor, continues: Tensor,
                            gamma: float, gae_lambda: float) -> Tensor:
-    """GAE (eq. 5), shared by the team: G_t = delta_t + gamma lambda c_t G_{t+1}. All tensors [T, W]."""
+    """GAE (eq. 5): G_t = delta_t + gamma lambda c_t G_{t+1}. All tensors [T, W], or of as many dimensions."""
     deltas = rewards + gamma * next_values - values
     return _discounted_sum(deltas, gamma * gae_lambda * continues)
 

@@ -34,11 +34,11 @@ class PolicyChunks(NamedTuple):
 class ValueChunks(NamedTuple):
     """What the critic learns from."""
 
-    states: Tensor         # [L, C, 1, S]
+    states: Tensor         # [L, C, V, S / V], of all agents together (V = 1) or of each (V = N)
     episode_start: Tensor  # [L, C] bool
-    values: Tensor         # [L, C] normalised, before the update
-    targets: Tensor        # [L, C] normalised
-    weights: Tensor        # [L, C]
+    values: Tensor         # [L, C, V] normalised, before the update
+    targets: Tensor        # [L, C, V] normalised
+    weights: Tensor        # [L, C, V]
 
 
 class ActionChunks(NamedTuple):

@@ -91,8 +91,8 @@ def help_to_learn() -> None:
     try:
         first = team.receive()
         settings = config.from_flat(json.loads(first['settings'].tobytes()))
-        *sizes, state_is_observations, has_wins = first['spec'].tolist()
-        spec = WorldSpec(*sizes, bool(state_is_observations), bool(has_wins))
+        numbers = first['spec'].tolist()
+        spec = WorldSpec(*numbers[:4], *map(bool, numbers[4:]))
         learner = Learner(spec, settings.learner, settings.reward_network, settings.run.seed, team,
                           chosen_device(spec, settings))
         while arrays := team.receive():

@@ -84,6 +84,7 @@ class DifferenceEstimator:
     def __init__(self, spec: WorldSpec, settings: LearnerSettings, reward_settings: RewardNetworkSettings, seed: int,
                  passes: Passes, exact_rewards: ExpectedRewards | None = None):
         self._settings = settings
+        self._num_values = spec.num_values
         self._exact_rewards = exact_rewards
         self._reward_settings = reward_settings
         self._passes = passes
@@ -101,16 +102,21 @@ class DifferenceEstimator:
         settings, metrics, trainings = self._settings, {}, []
         continues = (~(data.terminated | data.truncated)).float()
 
-        # Line 13: values, by the critic as it is before the update.
-        normalized_values, critic_states, final_values = self._values(data)
-        values = self._value_norm.denormalize(normalized_values)
-        next_values = values[1:] * continues
-        next_values[data.truncated] = self._value_norm.denormalize(final_values)
-        team = advantages.generalized_advantages(data.rewards, values[:-1], next_values, continues, settings.gamma,
-                                                 settings.gae_lambda)
+        # Line 13: values, by the critic as it is before the update, one for the team or one for each agent.
+        valued = self._valued(data.states)
+        normalized_values, critic_states, final_values = self._values(data, valued)
+        values, final_values = map(self._value_norm.denormalize, (normalized_values, final_values))
+        of_each = self._num_values > 1
+        if of_each and data.present is not None:
+            values, final_values = self._without_absent(values, final_values, data)
+        goes_on = continues.unsqueeze(-1)
+        next_values = values[1:] * goes_on
+        next_values[data.truncated] = final_values
+        shared = advantages.generalized_advantages(data.rewards.unsqueeze(-1), values[:-1], next_values, goes_on, settings.gamma,
+                                                   settings.gae_lambda)
         expected = None
         if self._exact_rewards is not None:
-            expected = torch.from_numpy(self._exact_rewards(data.map(lambda part: part.cpu().numpy()))).to(team)
+            expected = torch.from_numpy(self._exact_rewards(data.map(lambda part: part.cpu().numpy()))).to(shared)
         elif self._reward:
             remembered = as_remembered(data, self._reward_settings)
             predicted, inputs, states = ensemble_prediction(self._reward, remembered)
@@ -121,18 +127,19 @@ class DifferenceEstimator:
                 1 - error / data.rewards.var(correction=0).clamp_min(1e-12))
             if not self._reward_settings.freeze:
                 trainings = self._reward_trainings(remembered, inputs, states, rollout)
-        estimated = team.unsqueeze(-1).expand(data.actions.shape)
+        estimated = shared.expand(data.actions.shape)
         if expected is not None:
             estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
                                                                 settings.gae_lambda)
 
-        # Line 20: value targets; the critic sees one state per world, so it regresses on the agents' mean.
-        credited = advantages.mean_over_agents(estimated, data.present)
-        targets = values[:-1] + (credited if settings.value_target == 'difference' else team)
-        self._value_norm.update(targets)
+        # Line 20: value targets; where the critic sees one state per world, it regresses on the agents' mean.
+        credited = estimated if of_each else advantages.mean_over_agents(estimated, data.present).unsqueeze(-1)
+        targets = values[:-1] + (credited if settings.value_target == 'difference' else shared)
+        self._value_norm.update(advantages.among(targets, data.present if of_each else None))
         cut = partial(to_chunks, length=chunk_length(data, settings))
-        chunks = ValueChunks(cut(data.states[:-1].unsqueeze(2)), cut(data.episode_start[:-1]), cut(normalized_values[:-1]),
-                             cut(self._value_norm.normalize(targets)), cut(torch.ones_like(data.rewards)))
+        chunks = ValueChunks(cut(valued[:-1]), cut(data.episode_start[:-1]), cut(normalized_values[:-1]),
+                             cut(self._value_norm.normalize(targets)),
+                             cut(agent_weights(data) if of_each else torch.ones_like(targets)))
         first = first_states(critic_states[:-1], chunks.weights.shape[0])
         return Estimate(estimated, [self._critic_training(chunks, first, rollout), *trainings], metrics, expected)
 
@@ -166,14 +173,26 @@ class DifferenceEstimator:
         expected = advantages.expected_rewards(predicted, data.probabilities)
         return expected if data.present is None else torch.where(data.present, expected, data.rewards.unsqueeze(-1))
 
-    def _values(self, data: Trajectory):
-        """Normalised values [T + 1, W], the critic's recurrent states [T + 1, W, 1, H], values [K] of the final states."""
+    def _valued(self, states: Tensor) -> Tensor:
+        """[..., V, S / V] of states [..., S]: what is valued, the state of all agents together (V = 1) or of each (V = N)."""
+        return states.unflatten(-1, (self._num_values, -1))
+
+    def _values(self, data: Trajectory, valued: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Normalised values [T + 1, W, V], recurrent states [T + 1, W, V, H], values [K, V] of the final states."""
         critic = self._critic.network
-        outputs, hidden = self._passes.forward(critic, 1, data.states.unsqueeze(2), data.episode_start)
+        outputs, hidden = self._passes.forward(critic, self._num_values, valued, data.episode_start)
         with torch.no_grad():
             ongoing = torch.zeros(1, len(data.final_states), dtype=torch.bool, device=outputs.device)
-            final_values = critic(data.final_states[None, :, None], hidden[:-1][data.truncated], ongoing)[0].view(-1)
-        return outputs.flatten(1), hidden, final_values
+            final_values = critic(self._valued(data.final_states)[None], hidden[:-1][data.truncated], ongoing)[0][0, ..., 0]
+        return outputs.squeeze(-1), hidden, final_values
+
+    @staticmethod
+    def _without_absent(values: Tensor, final_values: Tensor, data: Trajectory) -> tuple[Tensor, Tensor]:
+        """Values [T + 1, W, N] and [K, N] in which one that has left, whose own state says nothing, is worth what those are on
+        average who are there."""
+        there = torch.cat([data.present, data.present[-1:] | data.episode_start[-1:, :, None]])
+        return tuple(torch.where(here, found, advantages.mean_over_agents(found, here).unsqueeze(-1))
+                     for found, here in ((values, there), (final_values, data.present[data.truncated])))
 
     def _critic_training(self, chunks: ValueChunks, first: Tensor, rollout: int) -> Training:
         settings, network = self._settings, self._critic.network
@@ -184,7 +203,7 @@ class DifferenceEstimator:
             return network.gradient(loss, shard.states, initial, shard.episode_start)
 
         batches = self._passes.epochs('critic', chunks, first, settings.epochs, settings.num_mini_batches, rollout)
-        return self._passes.train('critic', self._critic, gradient, batches, 1, losses.ValueLoss.sums)
+        return self._passes.train('critic', self._critic, gradient, batches, self._num_values, losses.ValueLoss.sums)
 
     def _reward_trainings(self, data: Trajectory, inputs: Tensor, states: list[Tensor], rollout: int) -> list[Training]:
         chunks = action_chunks(data, inputs, data.rewards, self._settings)

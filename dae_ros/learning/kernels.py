@@ -91,12 +91,12 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
     columns = batch.episode_start.shape
     agents = (*columns, batch.num_agents)
     rows, outputs = _rows(steps, batch)[0], steps[-1].outputs
-    if (rows, outputs) != (1, 1) if loss.kind == 'value' else rows != batch.num_agents:
+    if rows != batch.num_agents or loss.kind == 'value' and outputs != 1:
         raise ValueError(f'no {loss.kind} loss of {rows} rows of {outputs} outputs for {batch.num_agents} agents')
     numbers = loss.numbers + (0.0,) * (3 - len(loss.numbers))
-    shape = agents if loss.kind == 'policy' else columns
+    shape = columns if loss.kind == 'reward' else agents
     data = [_array(x, shape, torch.float32, kept) for x in (*loss.data, None)[:2]]
-    weights = _array(loss.weights, columns if loss.kind == 'value' else agents, torch.float32, kept)
+    weights = _array(loss.weights, agents, torch.float32, kept)
     terms = CLoss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _array(loss.actions, agents, torch.int64, kept),
                   (CArray * 2)(*data), weights, _array(loss.available, (*agents, outputs), torch.bool, kept))
     _check(library.network_gradient(_steps(steps, gradients), len(steps), _batch(steps, batch, kept), terms,

@@ -50,12 +50,12 @@ class PolicyLoss(NamedTuple):
 
 
 class ValueLoss(NamedTuple):
-    """The clipped value loss (eq. 40) with Huber errors, on normalised values [L, C, 1, 1]: the worse of moving freely
+    """The clipped value loss (eq. 40) with Huber errors, on normalised values [L, C, V, 1]: the worse of moving freely
     and within `clip`. Differentiated times `coefficient`."""
 
-    old_values: Tensor  # [L, C]
-    targets: Tensor     # [L, C]
-    weights: Tensor     # [L, C]
+    old_values: Tensor  # [L, C, V]
+    targets: Tensor     # [L, C, V]
+    weights: Tensor     # [L, C, V]
     clip: float
     delta: float
     coefficient: float
@@ -63,7 +63,7 @@ class ValueLoss(NamedTuple):
     sums = ('value/loss',)
 
     def __call__(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        values = values.flatten(1)
+        values = values.view_as(self.old_values)
         held = self.old_values + (values - self.old_values).clamp(-self.clip, self.clip)
         errors = torch.maximum(functional.huber_loss(values, self.targets, reduction='none', delta=self.delta),
                                functional.huber_loss(held, self.targets, reduction='none', delta=self.delta))

@@ -335,8 +335,9 @@ def make_actor(spec: WorldSpec, settings: LearnerSettings, seed: int) -> Recurre
 
 
 def make_critic(spec: WorldSpec, settings: LearnerSettings, seed: int) -> RecurrentNetwork:
-    """The central value network on the global state (algorithm 1, line 13)."""
-    critic = RecurrentNetwork(spec.state_size, 1, settings.hidden_size, settings.mlp_layers, settings.activation)
+    """The central value network on the global state (algorithm 1, line 13), or on each agent's own."""
+    critic = RecurrentNetwork(spec.state_size // spec.num_values, 1, settings.hidden_size, settings.mlp_layers,
+                              settings.activation)
     return _initialise(critic, _GAINS[settings.activation], 1.0, seed, 'critic')
 
 

@@ -23,7 +23,8 @@ class PettingZooWorlds(Worlds):
     """W instances of the environment `MODULE.parallel_env`, for the task `pettingzoo:MODULE`.
 
     - Observations are flattened to float32 and padded with zeros to the longest among the agents.
-    - The state is the environment's `state()`; where there is none, the padded observations one after another.
+    - The state is the environment's `state()`; where there is none, the padded observations one after another. Where agents
+      have a `state` in their infos, each is valued by its own; it is zeros for one that has left.
     - The team's reward is the mean of the agents' rewards; one that has left gets none.
     - An agent that ends before the others has left the team: it observes zeros, and its action is not passed on.
     - An episode ends with its last agents: terminated if these all are, truncated if not.
@@ -81,7 +82,14 @@ class PettingZooWorlds(Worlds):
         if observation_size == 0:
             raise WorldError(f'{self._name} shows its agents nothing')
 
-        environment.reset(seed=0)
+        _, infos = environment.reset(seed=0)
+        own = [np.size(infos[agent]['state']) for agent in self._agents if 'state' in infos.get(agent, {})]
+        self._has_own_states = bool(own)
+        if own:
+            if len(own) < task.num_agents or len(set(own)) > 1:
+                raise WorldError(f'the agents of {self._name} do not all have states of the same size in their infos')
+            return WorldSpec(task.num_agents, counts[0], observation_size, sum(own), state_is_observations=False,
+                             states_per_agent=True)
         try:
             state_size = np.asarray(environment.state(), dtype=np.float32).size
         except (NotImplementedError, AttributeError):
@@ -176,7 +184,13 @@ class PettingZooWorlds(Worlds):
             flat = np.ravel(values) if isinstance(space, spaces.Box) else spaces.utils.flatten(space, values)
             row[:flat.size] = flat
         shown.present[world] = [agent in present for agent in self._agents]
-        shown.state[world] = np.ravel(self._environments[world].state()) if self._has_state else np.ravel(observations)
+        if self._has_own_states:
+            states = shown.state[world].reshape(len(self._agents), -1)
+            states[:] = 0.0
+            for agent in present:
+                states[self._agents.index(agent)] = np.ravel(infos[agent]['state'])
+        else:
+            shown.state[world] = np.ravel(self._environments[world].state()) if self._has_state else np.ravel(observations)
 
 
 def _without_mask(space: Any) -> Any:

@@ -1,4 +1,4 @@
-"""A PettingZoo environment whose agents fall one by one: who attacks while tired falls, and the tired cannot rest twice."""
+"""A PettingZoo environment whose agents fall one by one: who attacks while tired falls, and nobody can rest twice in a row."""
 
 from __future__ import annotations
 
@@ -31,11 +31,15 @@ class Skirmish(ParallelEnv):
         self._enemy, self._steps = 1.5 * len(self.agents), 0
         self._tired = dict.fromkeys(self.agents, 0.0)
         self._rested = dict.fromkeys(self.agents, False)
-        return self._observe(), {agent: {} for agent in self.agents}
+        return self._observe(), self._states()
 
     def _observe(self):
         return {agent: {'observation': np.array([self._tired[agent], self._enemy / 5, self._steps / LENGTH], np.float32),
                         'action_mask': np.array([1, not self._rested[agent], 1], np.int8)} for agent in self.agents}
+
+    def _states(self):
+        """Each agent's own view of the whole: itself, the enemy, and how many are left."""
+        return {agent: {'state': np.array([self._tired[agent], self._enemy, len(self.agents)])} for agent in self.agents}
 
     def step(self, actions):
         self._steps += 1
@@ -48,7 +52,7 @@ class Skirmish(ParallelEnv):
         over, late = self._enemy <= 0, self._steps == LENGTH
         ended = {agent: over or agent in fallen for agent in self.agents}
         cut_off = dict.fromkeys(self.agents, late and not over)
-        told = self._observe(), dict.fromkeys(self.agents, float(len(attackers))), ended, cut_off, dict.fromkeys(self.agents, {})
+        told = self._observe(), dict.fromkeys(self.agents, float(len(attackers))), ended, cut_off, self._states()
         self.agents = [agent for agent in self.agents if not ended[agent] and not cut_off[agent]]
         return told
 

@@ -869,9 +869,9 @@ typedef struct {
     long kind;
     double numbers[3];
     Array actions; /* [L, C, N] int64 for POLICY and REWARD */
-    Array data[2]; /* POLICY: old log-probabilities, advantages [L, C, N]. VALUE: old values, targets [L, C].
+    Array data[2]; /* POLICY: old log-probabilities, advantages [L, C, N]. VALUE: old values, targets [L, C, N].
                       REWARD: rewards [L, C] */
-    Array weights; /* [L, C, N]; VALUE: [L, C] */
+    Array weights; /* [L, C, N] */
     Array available; /* POLICY: [L, C, N, A] bytes, 0 where an action cannot be chosen; NULL: all can */
 } Loss;
 
@@ -1110,12 +1110,12 @@ static void forward_block(const Step *steps, long count, long outputs, const Bat
             for (long at = (t * C + first) * N; at < (t * C + first + columns) * N; at++)
                 s->codes[row++] = at;
     if (loss) {
-        gather(&loss->weights, L, first, columns, loss->kind == VALUE ? size : N * size, s->weights);
+        gather(&loss->weights, L, first, columns, N * size, s->weights);
         if (loss->available.data)
             gather(&loss->available, L, first, columns, N * outputs, s->available);
         for (int i = 0; i < 2; i++)
             if (loss->data[i].data)
-                gather(&loss->data[i], L, first, columns, loss->kind == POLICY ? N * size : size, s->of_loss[i]);
+                gather(&loss->data[i], L, first, columns, loss->kind == REWARD ? size : N * size, s->of_loss[i]);
         if (loss->actions.data)
             gather(&loss->actions, L, first, columns, N * (long)sizeof(int64_t), s->actions);
     }
@@ -1142,7 +1142,7 @@ static void forward_block(const Step *steps, long count, long outputs, const Bat
  * on. */
 static void run_part(const Step *steps, long from, long count, const Batch *batch, const Loss *loss, long at, long size,
                      const Work *works, float *grad_table, double *sums, const Scratch *of_block) {
-    const long N = batch->agents, last = count - 1, per_step = loss && loss->kind == POLICY ? N : 1;
+    const long N = batch->agents, last = count - 1, per_step = loss && loss->kind == REWARD ? 1 : N;
     Scratch s = *of_block;
     Work own[MOST_STEPS];
     memcpy(own, works, (size_t)count * sizeof(Work));
@@ -1162,7 +1162,7 @@ static void run_part(const Step *steps, long from, long count, const Batch *batc
     s.actions += at * N;
     s.of_loss[0] += at * per_step;
     s.of_loss[1] += at * per_step;
-    s.weights += at * (loss->kind == VALUE ? 1 : N);
+    s.weights += at * N;
     if (s.available)
         s.available += at * N * steps[last].outputs;
     const long rows = size * own[last].rows, outputs = steps[last].outputs;
