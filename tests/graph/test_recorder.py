@@ -115,5 +115,7 @@ def test_the_overrides_for_ros2_bag_record_are_those_the_recorder_listens_with()
     topics = {f'/{topic.name}': topic.profile for topic in team_topics(8, 1, True)}
     assert set(overrides) == set(topics)
     for name, profile in topics.items():
+        unlimited = dict.fromkeys(('deadline', 'lifespan', 'liveliness_lease_duration'), {'sec': 0, 'nsec': 0})
         assert overrides[name] == {'history': 'keep_last', 'depth': profile.depth, 'reliability': 'reliable',
-                                   'durability': profile.durability.name.lower()}
+                                   'durability': profile.durability.name.lower(), 'liveliness': 'system_default',
+                                   'avoid_ros_namespace_conventions': False, **unlimited}
