@@ -138,6 +138,7 @@ def test_after_a_kill_everything_up_to_the_last_flush_is_readable(storage, compr
     dataset = Dataset(tmp_path / 'bag')
     assert same(played, dataset)
     assert set(dataset.skipped) <= {'truncated', 'incomplete'}
+    assert 'bag_0' in {path.stem for path in (tmp_path / 'bag').iterdir()}  # as `ros2 bag reindex` wants it
 
 
 def test_messages_are_flushed_as_time_goes_by(heard, played, tmp_path):

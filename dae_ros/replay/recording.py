@@ -108,8 +108,17 @@ class Recording:
         self._bytes = self._began = self._flushed = 0
 
 
+def _as_rosbag2_names_it(file: Path) -> Path:
+    """The file, renamed: `ros2 bag reindex` finds no others."""
+    return file.rename(file.with_name(f'{file.stem}_0{file.suffix}'))
+
+
 class _McapStorage(McapWriter):
     """MCAP whose chunks have checksums and reach the system as soon as they are complete."""
+
+    def __init__(self, path: Path, compression: CompressionMode):
+        super().__init__(path, compression)
+        self.path = _as_rosbag2_names_it(self.path)
 
     def close_chunk(self) -> None:
         begin, checksum = self.bio.tell(), crc32(self.chunk.bio.getbuffer())
@@ -130,6 +139,10 @@ class _Sqlite3Storage(Sqlite3Writer):
 
     def __init__(self, path: Path, compression: CompressionMode):
         super().__init__(path, compression)
+        self.conn.close()
+        self.path = _as_rosbag2_names_it(self.path)
+        self.conn = sqlite3.connect(self.path)
+        self.cursor = self.conn.cursor()
         self.conn.execute('PRAGMA cache_spill = 0')
 
     def flush(self) -> None:
