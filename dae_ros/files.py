@@ -1,9 +1,11 @@
-"""Files that are either whole or not there."""
+"""Files that are either whole or not there, and locks on them."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 from pathlib import Path
+from typing import BinaryIO
 
 from dae_ros.errors import FileError
 
@@ -34,3 +36,15 @@ def remove_unfinished(folder: Path) -> None:
     """Removes what writers left that were killed in the middle. Nobody may be writing to the folder."""
     for temporary in folder.glob(f'.*{_UNFINISHED}'):
         temporary.unlink(missing_ok=True)
+
+
+def hold(path: Path) -> BinaryIO | None:
+    """Makes the file and keeps others out until what this returns is closed, by the end of the process at the latest; None if
+    somebody else is in. Raises OSError."""
+    lock = open(path, 'wb')
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        return None
+    return lock

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 from pathlib import Path
 from typing import Any, BinaryIO, Mapping
@@ -12,7 +11,7 @@ import numpy as np
 from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.errors import Refused, RunFolderError
-from dae_ros.files import remove_unfinished, write_atomically
+from dae_ros.files import hold, remove_unfinished, write_atomically
 from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint
 
 
@@ -71,14 +70,11 @@ class RunFolder:
         Raises RunFolderError if there is one. Removes what one that was killed left half written.
         """
         try:
-            lock = open(self.path / 'trainer.lock', 'wb')
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                lock.close()
-                raise RunFolderError(f'another trainer is at work in {self.path}; stop it or choose another folder') from error
+            lock = hold(self.path / 'trainer.lock')
         except OSError as error:
             raise RunFolderError(f'cannot write the run folder {self.path}: {error.strerror}') from error
+        if lock is None:
+            raise RunFolderError(f'another trainer is at work in {self.path}; stop it or choose another folder')
         for folder in (self.path, self.checkpoints):
             remove_unfinished(folder)
         return lock

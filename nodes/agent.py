@@ -25,7 +25,7 @@ from dae_ros.config import (
 from dae_ros.errors import Refused, SettingsError
 from dae_ros.rollout.lockstep import AgentEnd, check_run
 from dae_ros.ros import convert, names, qos
-from dae_ros.ros.node import TeamNode, run_together, settings_of_process
+from dae_ros.ros.node import TeamNode, is_over, run_together, settings_of_process
 from dae_ros.ros.trust import team_key
 from dae_ros.types import Action
 from dae_ros.weights.codec import open_weights
@@ -79,8 +79,8 @@ class AgentNode(TeamNode):
 
     def _on_policy(self, message: msg.PolicyWeights) -> None:
         weights = convert.policy_weights(message)
-        check_run(weights.run, self._end.run)
-        self._act(self._end.on_policy(weights.version, open_weights(weights, self._key)))
+        check_run(weights.run, self._end.run)  # before the weights are looked at, which takes longer
+        self._act(self._end.on_policy(weights.run, weights.version, open_weights(weights, self._key)))
         self._fetch_if_passed()
 
     def _fetch_if_passed(self) -> None:
@@ -102,7 +102,7 @@ class AgentNode(TeamNode):
 
     def _on_status(self, message: msg.TrainingStatus) -> None:
         """An agent that joined the run it heard is free for the next one when that run is over."""
-        if message.state == msg.TrainingStatus.FINISHED and message.run == self._end.run and not self._bound:
+        if is_over(message) and message.run == self._end.run and not self._bound:
             self._end = AgentEnd(self._end.robot, group=self._group)
 
     def _act(self, action: Action | None) -> None:

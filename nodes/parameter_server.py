@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import BinaryIO
 
 from dae_ros_msgs import msg, srv
 
 from dae_ros.config import ParameterServerSettings, RunBinding, TeamKey, declarations
 from dae_ros.errors import Refused, RunFolderError
+from dae_ros.files import hold
 from dae_ros.rollout.lockstep import check_run
 from dae_ros.ros import convert, names, qos
-from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.node import TeamNode, is_over, run
 from dae_ros.ros.trust import team_key
 from dae_ros.types import PolicyWeights
 from dae_ros.weights.codec import open_weights, seal
@@ -32,6 +34,7 @@ class ParameterServerNode(TeamNode):
         self._run = self.settings['run']
         self._bound = self._run != 0
         self._store: PolicyStore | None = None
+        self._claim: BinaryIO | None = None  # to its folder
         self._version: int | None = None
         self._policy = self.publisher(msg.PolicyWeights, names.POLICY, qos.LATCHED)
         if self._bound:
@@ -44,6 +47,10 @@ class ParameterServerNode(TeamNode):
         """Opens the run's folder and serves its newest version."""
         folder = Path(self.settings['policies_folder']) / f'{self._run:016x}'
         try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            self._claim = hold(folder.with_suffix('.lock'))
+            if self._claim is None:
+                raise RunFolderError(f'another parameter server is at work in {folder}; stop it or choose another folder')
             self._store = PolicyStore(folder, self.settings['keep_policies'])
         except OSError as error:
             raise RunFolderError(f'cannot write the policies to {folder}: {error.strerror}') from error
@@ -79,8 +86,9 @@ class ParameterServerNode(TeamNode):
 
     def _on_status(self, message: msg.TrainingStatus) -> None:
         """A server that joined the run it heard takes the next one's policies when that run is over."""
-        if message.state == msg.TrainingStatus.FINISHED and message.run == self._run and not self._bound:
+        if is_over(message) and message.run == self._run and not self._bound:
             self._run, self._store, self._version = 0, None, None
+            self._claim.close()
 
     def diagnose(self):
         sentence = 'waiting for a policy' if self._version is None else f'serving policy version {self._version}'

@@ -5,14 +5,14 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from pathlib import Path
-from typing import Any, Callable, NamedTuple
+from typing import Any, Callable, NamedTuple, NoReturn
 
 from dae_ros_msgs import msg
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
@@ -36,7 +36,7 @@ from dae_ros.learning.distributed import help_to_learn
 from dae_ros.restarts import EXIT_REFUSED
 from dae_ros.rollout.groups import GroupedAssembler
 from dae_ros.ros import convert, convert_robots, names, qos
-from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.node import FAREWELL, TeamNode, is_over, run
 from dae_ros.ros.trust import team_key
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
@@ -46,7 +46,8 @@ from dae_ros.worlds import world_spec
 from dae_ros.worlds.particle import TIME_STEP
 
 Status = msg.TrainingStatus
-FAREWELL = Duration(seconds=2)  # to let the last status reach who listens
+MAKE_WAY_AFTER = {  # attempts in vain beside another trainer, by whether anyone has answered and whether the other is ahead
+    (False, True): 1, (False, False): 3, (True, True): 5}
 SHORT_PATIENCE = 1.0  # s; with nodes that have just started: what is sent before they have found each other may be lost
 
 
@@ -156,7 +157,8 @@ class TrainerNode(TrainingNode):
         self.create_service(Trigger, names.RESUME, self._on_resume)
         self.listen(Status, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
         self._rival: Status | None = None  # of another trainer that is at work here
-        self._answered = False  # whether anything has ever arrived
+        self._answered = False  # whether anything has ever arrived, and a whole rollout
+        self._settled = False
         self._heard = False  # whether anything of the rollout under way has arrived, and when the last of it; s, monotonic
         self._heard_at = 0.0
         self._silent_attempts = 0  # in a row
@@ -241,7 +243,7 @@ class TrainerNode(TrainingNode):
         self._heard, self._heard_at, self._answered = True, time.monotonic(), True
         if not self._assembler.complete:
             return
-        self._patience, self._silent_attempts = self._training.settings.run.rollout_timeout, 0
+        self._patience, self._silent_attempts, self._settled = self._training.settings.run.rollout_timeout, 0, True
         self._learn(self._assembler.trajectory())
         self._advance()
 
@@ -251,11 +253,11 @@ class TrainerNode(TrainingNode):
         patience = min(self._patience, settings.rollout_timeout)
         if not self._collecting or time.monotonic() - self._heard_at < patience:
             return
+        self._silent_attempts += 1
         self._make_way()
         sentence = f'nothing heard for {patience:g} s; missing: {self._assembler.missing()}'
-        self._silent_attempts += 1
         if self._silent_attempts >= settings.max_silent_attempts:
-            raise StalledError(f'given up after {self._silent_attempts} attempts at a rollout: {sentence}')
+            self._fail(f'given up after {self._silent_attempts} attempts at a rollout: {sentence}')
         self.get_logger().warning(f'{sentence}; the rollout is begun anew')
         if patience == settings.rollout_timeout:
             self._announce(self._state, sentence)
@@ -267,16 +269,28 @@ class TrainerNode(TrainingNode):
         """Takes note of another trainer."""
         if status.run == self._training.run:
             return
-        self._rival = None if status.state in (Status.FINISHED, Status.FAILED) else status
-        if not self._answered:
+        self._rival = None if is_over(status) else status
+        if not self._answered or is_over(status) and not self._settled:  # then the other's nodes are free
             self._patience = SHORT_PATIENCE
 
     def _make_way(self) -> None:
-        """Raises StalledError if the team, which has never answered, is another trainer's."""
-        rival = self._rival
-        if rival is not None and not self._answered:
-            raise StalledError(f'another trainer is at work here: its run {rival.run:x} has {rival.environment_steps} of '
-                               f'{rival.total_steps} steps. Start this one in a namespace of its own, or when that one is done')
+        """Ends this trainer if the team is another's: nobody answers it, or some do not who may have joined the other's run.
+
+        Of two that started at once on nodes bound to no run the one stays whom the nodes answered, or who is ahead.
+        """
+        rival, training = self._rival, self._training
+        if rival is None or self._settled:
+            return
+        behind = (rival.environment_steps, rival.run) > (training.environment_steps, training.run)
+        if self._silent_attempts >= MAKE_WAY_AFTER.get((self._answered, behind), math.inf):
+            self._fail(f'another trainer is at work here: its run {rival.run:x} has {rival.environment_steps} of '
+                       f'{rival.total_steps} steps. Start this one in a namespace of its own, or when that one is done')
+
+    def _fail(self, sentence: str) -> NoReturn:
+        """Ends this trainer; nodes that joined its run are free. Raises StalledError."""
+        self._announce(Status.FAILED, sentence)
+        self._status.wait_for_all_acked(FAREWELL)
+        raise StalledError(sentence)
 
     # What others see.
 

@@ -23,7 +23,7 @@ from dae_ros.config import (
 )
 from dae_ros.rollout.lockstep import WorldEnd, check_request
 from dae_ros.ros import convert, names, qos
-from dae_ros.ros.node import TeamNode, run, settings_of_process
+from dae_ros.ros.node import TeamNode, is_over, run, settings_of_process
 from dae_ros.types import JointState, Observation, RolloutRequest
 from dae_ros.worlds import make_worlds
 
@@ -53,12 +53,17 @@ class WorldNode(TeamNode):
         self.listen(msg.TrainingStatus, names.TRAINING_STATUS, qos.LATCHED_INPUT, self._on_status)
         self.listen(msg.RolloutRequest, names.ROLLOUT_REQUEST, qos.LATCHED_INPUT, self._on_request)
 
+    @property
+    def _run(self) -> int:
+        """The run whose request this world has taken, or that it was bound to; 0 for none."""
+        return self._end.run if self._wanted is None else self._wanted.run
+
     def on_matched(self) -> None:
         self._begin_if_ready()
 
     def _on_request(self, message: msg.RolloutRequest) -> None:
         request = convert.rollout_request(message)
-        check_request(request, self._wanted or self._end.request, self._end.run)
+        check_request(request, self._wanted or self._end.request, self._run)
         self._wanted = request
         self._begin_if_ready()
 
@@ -82,8 +87,8 @@ class WorldNode(TeamNode):
 
     def _on_status(self, message: msg.TrainingStatus) -> None:
         """A world that joined the run it heard is free for the next one when that run is over."""
-        if message.state == msg.TrainingStatus.FINISHED and message.run == self._end.run and not self._bound:
-            self._end = WorldEnd(self._worlds, group=self._group)
+        if is_over(message) and message.run == self._run and not self._bound:
+            self._end, self._wanted = WorldEnd(self._worlds, group=self._group), None
 
     def _send(self, data) -> None:
         for datum in data:
@@ -102,7 +107,7 @@ class WorldNode(TeamNode):
             sentence = f'waiting for actions of robots {self._end.waiting_for}'
         else:
             sentence = 'waiting for a request'
-        values = {'run': f'{self._end.run:x}'} | ({'group': self._group} if self._world_groups > 1 else {})
+        values = {'run': f'{self._run:x}'} | ({'group': self._group} if self._world_groups > 1 else {})
         return sentence, values if request is None else {**values, 'rollout': request.rollout, 'attempt': request.attempt}
 
     def close(self) -> None:

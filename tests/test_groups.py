@@ -128,7 +128,7 @@ def play(group, request=REQUEST, worlds=None, policy=POLICY):
     world, agents = WorldEnd(worlds or make_worlds(TASK), group=group), [AgentEnd(robot, group=group) for robot in range(N)]
     for agent in agents:
         agent.on_request(request)
-        agent.on_policy(request.policy_version, policy)
+        agent.on_policy(request.run, request.policy_version, policy)
     said, new = [], world.on_request(request)
     while new:
         said += [datum for datum in new if not isinstance(datum, Observation)]

@@ -19,8 +19,8 @@ from dae_ros.worlds.base import JointObservation, Transition, Worlds
 T, W, N, A, O, S = 4, 3, 2, 3, 2, 5
 SPEC = WorldSpec(N, A, O, S, state_is_observations=False)
 SIZES = PolicyArchitecture(O, A, hidden_size=4, mlp_layers=1, activation='relu')
-VERSION = 7
-REQUEST = RolloutRequest(run=5, rollout=3, attempt=1, policy_version=VERSION, seed=11, num_steps=T, greedy=False)
+RUN, VERSION = 5, 7
+REQUEST = RolloutRequest(run=RUN, rollout=3, attempt=1, policy_version=VERSION, seed=11, num_steps=T, greedy=False)
 
 
 class Drifting(Worlds):
@@ -82,7 +82,7 @@ def play(request=REQUEST, worlds=Drifting):
     world, agents = WorldEnd(worlds()), [AgentEnd(robot) for robot in range(N)]
     for agent in agents:
         agent.on_request(request)
-        agent.on_policy(VERSION, POLICY)
+        agent.on_policy(RUN, VERSION, POLICY)
     said, new = [], world.on_request(request)
     while new:
         said += new
@@ -500,7 +500,7 @@ def agent_with(*steps, robot=0):
     """An agent end that knows request and policy and acted at the given steps."""
     agent = AgentEnd(robot)
     agent.on_request(REQUEST)
-    agent.on_policy(VERSION, POLICY)
+    agent.on_policy(RUN, VERSION, POLICY)
     for step in steps:
         assert_same(agent.on_observation(OBSERVATIONS[robot][step]), ACTIONS[robot][step])
     return agent
@@ -509,7 +509,7 @@ def agent_with(*steps, robot=0):
 @pytest.mark.parametrize('order', ['rpo', 'pro', 'rop', 'por', 'orp', 'opr'])
 def test_an_agent_acts_once_request_policy_and_observation_are_there_in_whatever_order(order):
     agent = AgentEnd(1)
-    takes = {'r': lambda: agent.on_request(REQUEST), 'p': lambda: agent.on_policy(VERSION, POLICY),
+    takes = {'r': lambda: agent.on_request(REQUEST), 'p': lambda: agent.on_policy(RUN, VERSION, POLICY),
              'o': lambda: agent.on_observation(OBSERVATIONS[1][0])}
     answers = [takes[what]() for what in order]
     assert answers[:2] == [None, None]
@@ -520,27 +520,27 @@ def test_an_agent_acts_once_request_policy_and_observation_are_there_in_whatever
 
 def test_an_agent_acts_with_the_version_asked_for_and_with_no_other():
     agent = AgentEnd(0)
-    agent.on_policy(VERSION - 1, make_policy(VERSION - 1))
+    agent.on_policy(RUN, VERSION - 1, make_policy(VERSION - 1))
     agent.on_request(REQUEST)
     assert agent.missing_version == VERSION and agent.newest_version == VERSION - 1
     assert agent.on_observation(OBSERVATIONS[0][0]) is None
-    assert agent.on_policy(VERSION + 1, make_policy(VERSION + 1)) is None
+    assert agent.on_policy(RUN, VERSION + 1, make_policy(VERSION + 1)) is None
     assert agent.missing_version == VERSION and agent.newest_version == VERSION + 1
-    assert_same(agent.on_policy(VERSION, POLICY), ACTIONS[0][0])
+    assert_same(agent.on_policy(RUN, VERSION, POLICY), ACTIONS[0][0])
     assert agent.missing_version is None
 
 
 def test_an_agent_keeps_the_version_in_use_however_many_newer_ones_come():
     agent = agent_with(0)
     for version in range(VERSION + 1, VERSION + 5):
-        agent.on_policy(version, make_policy(version))
+        agent.on_policy(RUN, version, make_policy(version))
     for step in range(1, T):
         assert_same(agent.on_observation(OBSERVATIONS[0][step]), ACTIONS[0][step])
 
 
 def test_an_agent_refuses_a_version_it_holds():
     agent = agent_with(0)
-    refused('duplicate', agent.on_policy, VERSION, make_policy(1))
+    refused('duplicate', agent.on_policy, RUN, VERSION, make_policy(1))
     assert_same(agent.on_observation(OBSERVATIONS[0][1]), ACTIONS[0][1])
 
 
@@ -613,14 +613,14 @@ def test_an_agent_that_waits_for_a_policy_forgets_the_observation_of_an_attempt_
     agent.on_request(REQUEST)
     assert agent.on_observation(OBSERVATIONS[0][0]) is None
     agent.on_request(REQUEST._replace(attempt=2))
-    assert agent.on_policy(VERSION, POLICY) is None
+    assert agent.on_policy(RUN, VERSION, POLICY) is None
     answer = agent.on_observation(stamped(OBSERVATIONS[0][0], attempt=2))
     assert_same(answer, stamped(ACTIONS[0][0], attempt=2))
 
 
 def test_an_agent_keeps_an_observation_that_came_before_its_request_and_one_more_that_was_given_up():
     agent = AgentEnd(0)
-    agent.on_policy(VERSION, POLICY)
+    agent.on_policy(RUN, VERSION, POLICY)
     assert agent.on_observation(stamped(OBSERVATIONS[0][0], attempt=2)) is None
     assert agent.on_request(REQUEST) is None
     assert_same(agent.on_request(REQUEST._replace(attempt=2)), stamped(ACTIONS[0][0], attempt=2))
@@ -632,7 +632,7 @@ def test_an_agent_that_waits_for_a_policy_refuses_a_second_observation_of_the_st
     assert agent.on_observation(genuine) is None
     for other in (genuine, genuine._replace(values=genuine.values + 1), genuine._replace(values=wider(genuine.values))):
         refused('duplicate', agent.on_observation, other)
-    assert_same(agent.on_policy(VERSION, POLICY), ACTIONS[0][0])
+    assert_same(agent.on_policy(RUN, VERSION, POLICY), ACTIONS[0][0])
 
 
 def test_an_agent_without_a_run_joins_that_of_its_first_request_and_one_with_a_run_keeps_it():
@@ -645,6 +645,30 @@ def test_an_agent_without_a_run_joins_that_of_its_first_request_and_one_with_a_r
     assert bound.request is None
 
 
+def test_an_agent_without_a_run_acts_with_the_policy_of_the_run_that_asks_it_and_of_no_other():
+    agent = AgentEnd(0)
+    agent.on_policy(6, VERSION, make_policy(1))
+    agent.on_observation(stamped(OBSERVATIONS[0][0], run=6))
+    assert agent.on_request(REQUEST) is None and agent.missing_version == VERSION
+    assert agent.on_observation(OBSERVATIONS[0][0]) is None
+    assert_same(agent.on_policy(RUN, VERSION, POLICY), ACTIONS[0][0])
+    refused('wrong_run', agent.on_policy, 6, VERSION + 1, POLICY)
+
+
+def test_an_agent_without_a_run_keeps_policies_of_a_few_runs_until_one_asks_it():
+    agent = AgentEnd(0)
+    for run in (RUN, 6, 7, 8):
+        for version in (VERSION - 2, VERSION - 1, VERSION):
+            agent.on_policy(run, version, POLICY if run == RUN else make_policy(run))
+    agent.on_request(REQUEST)
+    assert_same(agent.on_observation(OBSERVATIONS[0][0]), ACTIONS[0][0])
+    flooded = AgentEnd(0)
+    for run in range(1, 1000):
+        flooded.on_policy(run, VERSION, POLICY)
+    flooded.on_request(REQUEST)
+    assert flooded.missing_version == VERSION
+
+
 # All of them, on a network that delays, reorders and repeats.
 
 
@@ -655,7 +679,7 @@ class Network:
         self._random, self._repeats = random.Random(seed), repeats
         self.world, self.assembler = WorldEnd(Drifting()), Assembler(SPEC, W)
         self.agents = [AgentEnd(robot) for robot in range(N)]
-        self._under_way = [(agent.on_policy, (VERSION, POLICY)) for agent in self.agents]
+        self._under_way = [(agent.on_policy, (RUN, VERSION, POLICY)) for agent in self.agents]
 
     def ask(self, request):
         self.assembler.begin(request)

@@ -25,7 +25,7 @@ from tests.test_learner import (  # noqa: F401
     random_trajectory,
     state_of,
 )
-from tests.test_lockstep import POLICY, REQUEST, VERSION, A, Drifting, N, W, assert_same, play, refused, stamped
+from tests.test_lockstep import POLICY, REQUEST, RUN, VERSION, A, Drifting, N, W, assert_same, play, refused, stamped
 
 LONG = REQUEST._replace(num_steps=24)
 
@@ -100,7 +100,7 @@ def test_the_order_of_messages_does_not_matter_and_an_answer_nobody_waits_for_ch
 def test_an_agent_that_missed_a_step_at_which_it_was_present_does_not_go_on():
     agent = AgentEnd(0)
     agent.on_request(LONG)
-    agent.on_policy(VERSION, POLICY)
+    agent.on_policy(RUN, VERSION, POLICY)
     observations = [datum for datum in DATA if isinstance(datum, Observation) and datum.robot == 0]
     agent.on_observation(observations[0])
     later = next(datum for datum in observations[2:] if not datum.episode_start.all())
@@ -128,7 +128,7 @@ def test_flags_that_leave_a_robot_nothing_to_do_and_flags_of_other_sizes_are_ref
     assembler, agent = Assembler(Thinning.spec, W), AgentEnd(observation.robot)
     assembler.begin(LONG)
     agent.on_request(LONG)
-    agent.on_policy(VERSION, POLICY)
+    agent.on_policy(RUN, VERSION, POLICY)
     refused(Refused.OUT_OF_RANGE, assembler.on_joint_state, joint._replace(available=np.zeros_like(joint.available)))
     refused(Refused.OUT_OF_RANGE, agent.on_observation, observation._replace(available=np.zeros_like(observation.available)))
     refused(Refused.WRONG_SHAPE, assembler.on_joint_state, joint._replace(available=joint.available[..., 1:]))

@@ -47,7 +47,7 @@ class _Group:
         for agent in self._agents:
             agent.on_request(request)
             if agent.missing_version is not None:
-                agent.on_policy(request.policy_version, policy)
+                agent.on_policy(request.run, request.policy_version, policy)
         data = self._world.on_request(request)
         while data:
             actions = []

@@ -20,6 +20,8 @@ from dae_ros.worlds.base import JointObservation, Worlds
 WorldDatum = Union[JointState, SharedReward, Observation]
 
 PROBABILITY_SUM_TOLERANCE = 1e-3  # float32 softmax over any number of actions stays far within this
+KEPT_VERSIONS = 2  # of a run's policy, beside the one in use
+KEPT_RUNS = 4      # whose policies an agent keeps that does not know yet which run will ask it
 
 
 def check_run(run: int, own_run: int) -> None:
@@ -182,14 +184,17 @@ class WorldEnd:
 
 
 class AgentEnd:
-    """Acts for one robot of one group: only on the rollout asked for, only with the version it names, each step once."""
+    """Acts for one robot of one group: only on the rollout asked for, only with the version it names, each step once.
+
+    `run` as for `WorldEnd`: until a request tells its run, policies of several may come, and observations.
+    """
 
     def __init__(self, robot: int, run: int = 0, group: int = 0):
         self.robot = robot
         self._group = group
         self.run = run
         self.request: RolloutRequest | None = None
-        self._policies: dict[int, Policy] = {}
+        self._policies: dict[tuple[int, int], Policy] = {}  # by run and version
         self._pending: Observation | None = None  # of the rollout under way, waiting for the policy it names
         self._early: Observation | None = None    # of a rollout whose request is still on its way
         self._next_step = 0
@@ -198,34 +203,43 @@ class AgentEnd:
     @property
     def newest_version(self) -> int | None:
         """The newest policy version held."""
-        return max(self._policies, default=None)
+        return max((version for _, version in self._policies), default=None)
 
     @property
     def missing_version(self) -> int | None:
         """The version that the rollout under way names and this agent does not hold."""
         version = None if self.request is None else self.request.policy_version
-        return version if version not in self._policies else None
+        return version if (self.run, version) not in self._policies else None
 
     def on_request(self, request: RolloutRequest) -> Action | None:
         """Takes note of the rollout under way."""
         check_request(request, self.request, self.run)
         self.run, self.request, self._next_step, self._state, self._pending = request.run, request, 0, None, None
+        self._policies = {key: policy for key, policy in self._policies.items() if key[0] == self.run}
         early = self._early
-        if early is None or early.stamp.order > request.order:
+        if early is None or early.stamp.run == self.run and early.stamp.order > request.order:
             return None
         self._early = None
-        return self.on_observation(early) if early.stamp.order == request.order else None
+        return self.on_observation(early) if (early.stamp.run, early.stamp.order) == (self.run, request.order) else None
 
-    def on_policy(self, version: int, policy: Policy) -> Action | None:
+    def on_policy(self, run: int, version: int, policy: Policy) -> Action | None:
         """Takes in one version of the policy; the two newest and the one in use are kept."""
-        if version in self._policies:
+        check_run(run, self.run)
+        if (run, version) in self._policies:
             raise Refused(Refused.DUPLICATE, f'policy version {version}')
-        self._policies[version] = policy
+        self._policies[run, version] = policy
         in_use = None if self.request is None else self.request.policy_version
-        for old in sorted(self._policies)[:-2]:
+        for old in self._versions(run)[:-KEPT_VERSIONS]:
             if old != in_use:
-                del self._policies[old]
+                del self._policies[run, old]
+        if len(runs := dict.fromkeys(run for run, _ in self._policies)) > KEPT_RUNS:
+            first = next(iter(runs))
+            self._policies = {key: policy for key, policy in self._policies.items() if key[0] != first}
         return self._act()
+
+    def _versions(self, run: int) -> list[int]:
+        """Versions held of a run's policy, oldest first."""
+        return sorted(version for of, version in self._policies if of == run)
 
     def on_observation(self, observation: Observation) -> Action | None:
         """The action that answers the observation, or None while the request or the policy it needs is on its way."""
@@ -253,10 +267,10 @@ class AgentEnd:
     def _act(self) -> Action | None:
         """Answers the pending observation once the policy it names is here."""
         pending, request = self._pending, self.request
-        if pending is None or pending.policy_version not in self._policies:
+        if pending is None or (self.run, pending.policy_version) not in self._policies:
             return None
         self._pending = None
-        probabilities, self._state = respond(self._policies[pending.policy_version], pending, self._state)
+        probabilities, self._state = respond(self._policies[self.run, pending.policy_version], pending, self._state)
         seed = draws.group_seed(request.seed, self._group)
         actions = choose(probabilities, request.greedy, seed, request.rollout, pending.stamp.step, self.robot)
         self._next_step = pending.stamp.step + 1

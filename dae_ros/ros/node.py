@@ -8,10 +8,12 @@ from collections import Counter
 from typing import Any, Callable, Iterable
 
 import rclpy
+from dae_ros_msgs.msg import TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -33,6 +35,7 @@ except ImportError:  # an older Jazzy: its executor builds a wait set of everyth
     from rclpy.executors import SingleThreadedExecutor as Executor
 
 DIAGNOSTICS_PERIOD = 1.0  # s
+FAREWELL = Duration(seconds=2)  # to let a node's last words reach who listens
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 LONG = 3600.0  # s; without a limit this executor does not wait but spins
 
@@ -142,15 +145,27 @@ class TeamNode(Node):
         """Publishes the node's state and the counts of refused messages."""
         message, values = self.diagnose()
         values |= {f'refused {topic} {reason}': count for (topic, reason), count in sorted(self._refusals.items())}
-        level = DiagnosticStatus.WARN if self._refusals or self.is_in_trouble else DiagnosticStatus.OK
+        self._report(DiagnosticStatus.WARN if self._refusals or self.is_in_trouble else DiagnosticStatus.OK, message, values)
+
+    def _report(self, level: bytes, message: str, values: dict[str, Any]) -> None:
         status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=message,
                                   values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
         report = DiagnosticArray(status=[status])
         report.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(report)
 
+    def say_why(self, error: DaeRosError) -> None:
+        """The last report of a node that ends because of this."""
+        self._report(DiagnosticStatus.ERROR, str(error), {})
+        self._diagnostics.wait_for_all_acked(FAREWELL)
+
     def close(self) -> None:
         """Releases what the node holds beyond ROS; called once, also after an error."""
+
+
+def is_over(training: TrainingStatus) -> bool:
+    """Whether it has ended, well or not: nodes that joined it and are not bound to its run are free for another."""
+    return training.state in (TrainingStatus.FINISHED, TrainingStatus.FAILED)
 
 
 def settings_of_process(name: str, declared: Iterable[SettingInfo]) -> dict[str, Any]:
@@ -198,6 +213,8 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
             while rclpy.ok():
                 executor.spin_once(LONG)
                 for node in nodes:
+                    if isinstance(node.failure, DaeRosError):
+                        node.say_why(node.failure)
                     if node.failure is not None:
                         raise node.failure
                     if node.done:
