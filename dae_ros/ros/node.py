@@ -28,6 +28,7 @@ from dae_ros.command import refuse
 from dae_ros.config import SettingInfo
 from dae_ros.errors import DaeRosError, Refused
 from dae_ros.ros import names, params, qos
+from dae_ros.ros.clock_watch import ClockWatch
 
 try:
     from rclpy.experimental import EventsExecutor as Executor
@@ -168,6 +169,13 @@ def is_over(training: TrainingStatus) -> bool:
     return training.state in (TrainingStatus.FINISHED, TrainingStatus.FAILED)
 
 
+def set_timers_anew(nodes: Iterable[Node]) -> None:
+    """Has the executor wait for the timers' next moments as its clock shows them now."""
+    for node in nodes:
+        for timer in node.timers:
+            timer.reset()
+
+
 def settings_of_process(name: str, declared: Iterable[SettingInfo]) -> dict[str, Any]:
     """What the command line says before the nodes are made whose number and kind depend on it. Raises SettingsError.
 
@@ -191,7 +199,7 @@ def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int
 def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | None = None) -> int:
     """Runs the nodes of one process side by side, until one is done; otherwise as `run`."""
     nodes: list[TeamNode] = []
-    executor = None
+    executor = watch = None
 
     def interrupt(number, frame) -> None:
         """Ctrl-C breaks into our own callbacks, not into the executor's work; that stops by itself, as on SIGTERM."""
@@ -210,6 +218,7 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
             # again, a quarter of an agent's time, since every message makes a few objects.
             gc.collect()
             gc.freeze()
+            watch = ClockWatch(lambda: set_timers_anew(nodes))
             while rclpy.ok():
                 executor.spin_once(LONG)
                 for node in nodes:
@@ -229,6 +238,8 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
             # A terminal and a launch file each send their own Ctrl-C: the second must not break into the cleaning up.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, signal.SIG_IGN)
+            if watch is not None:
+                watch.close()
             if executor is not None:
                 executor.shutdown()
             for node in nodes:

@@ -1,19 +1,33 @@
-"""Nothing waits by a clock that can be set: timers go on where a node's time stands still, and nobody else asks for the time."""
+"""Nothing waits by a clock that can be set: a training goes on when the host's clock jumps, or a node's time stands still."""
 
 from __future__ import annotations
 
 import re
+import struct
+import subprocess
+import time
+from pathlib import Path
 
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import REPOSITORY, TIMEOUT, Listener
+from harness import REPOSITORY, SMALL, TIMEOUT, Listener, bringup, finish, oracle
 from test_parameters import start
 
+from dae_ros import config
+from dae_ros.learning.native import build
+from dae_ros.report.summary import Summary
 from dae_ros.ros import names, qos
+from dae_ros.ros.graph import training_graph
+from dae_ros.run_folder import RunFolder
+
+HOUR = 3600  # s
 
 WALL_CLOCK = re.compile(r'time\.time\b|time_ns\(|datetime\.now|clock_gettime')
-MAY_ASK = {'nodes/bringup.py',          # to name a folder
-           'nodes/recorder.py',         # to name a bag, and once for the stamps in it
-           'dae_ros/ros/graph_run.py',  # for the age of files, as the next
+MAY_ASK = {'dae_ros/ros/clock_watch.py',  # whether it was set
+           'nodes/bringup.py',            # to name a folder, as the next
+           'dae_ros/ros/launched.py',
+           'nodes/recorder.py',           # to name a bag, and once for the stamps in it
+           'dae_ros/ros/process_run.py',  # for the age of files, as the next
            'dae_ros/ros/shared_memory.py'}
 
 
@@ -34,3 +48,58 @@ def test_nobody_asks_a_clock_that_can_be_set_but_for_names_and_ages_of_files_and
     sources = [path for folder in ('dae_ros', 'nodes') for path in (REPOSITORY / folder).rglob('*.py')]
     asking = {path.relative_to(REPOSITORY).as_posix() for path in sources if WALL_CLOCK.search(path.read_text())}
     assert asking <= MAY_ASK
+
+
+class HostClock:
+    """Sets the host's clock, as far as processes that are started from here on can tell. To this one it is as ever."""
+
+    def __init__(self, library: Path, offset: Path, monkeypatch):
+        self._offset = offset
+        self.set(0)
+        monkeypatch.setenv('CLOCK_OFFSET', str(offset))
+        monkeypatch.setenv('LD_PRELOAD', str(library))
+
+    def set(self, seconds: int) -> None:
+        with open(self._offset, 'r+b' if self._offset.exists() else 'wb') as file:
+            file.write(struct.pack('=q', seconds))
+
+
+@pytest.fixture
+def host_clock(tmp_path, monkeypatch):
+    library = tmp_path / 'clock_jump.so'
+    try:
+        subprocess.run([*build.compiler(), '-O2', '-shared', '-fPIC', str(Path(__file__).with_name('clock_jump.c')), '-o',
+                        str(library), '-ldl'], check=True, timeout=TIMEOUT)
+    except build.BuildError as error:
+        pytest.skip(str(error))
+    return HostClock(library, tmp_path / 'offset', monkeypatch)
+
+
+def test_a_training_goes_on_to_the_same_weights_when_the_clock_is_set_back_and_forward_by_an_hour(domain, host_clock, tmp_path):
+    values = {**SMALL, 'total_steps': 80 * 8 * 25, 'rollout_timeout': 60.0}
+    settings = config.from_flat(values)
+    folder = RunFolder(tmp_path / 'run', settings)
+    nodes = {f'/{node}' for process in training_graph(settings, folder) for node in process.nodes}
+    shown: dict[str, int] = {}  # hours that a node's clock is off
+
+    def hear(report: DiagnosticArray) -> None:
+        shown[report.status[0].name] = round((report.header.stamp.sec - time.time()) / HOUR)
+
+    process = bringup(folder.path, values)
+    try:
+        with Listener() as listener:
+            listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, hear, qos.EVENTS)
+            listener.wait_for_status(lambda status: status.policy_version >= 3)
+            attempts = (folder.path / 'attempts').read_text()
+            for hours in (-1, 0):
+                host_clock.set(hours * HOUR)
+                listener.spin_until(lambda: shown == dict.fromkeys(nodes, hours), lambda: str(shown))
+        code, output, errors = finish(process)
+    finally:
+        process.kill()
+    assert code == 0, output + errors
+    summary = Summary.read(folder.summary_file)
+    assert (summary.weights_sha256, summary.evaluation_return) == oracle(tmp_path / 'alone', values)
+    assert (folder.path / 'attempts').read_text() == attempts, 'a rollout was begun anew'
+    assert 'is killed' not in output and 'started again' not in output
+    assert not any('Traceback' in text for text in (output, errors, *(log.read_text() for log in folder.path.glob('logs/*'))))

@@ -29,17 +29,17 @@ class BuildError(Exception):
 
 def build(target: Path, *flags: str) -> None:
     """Compiles the library to `target`, with more flags if given; it appears whole or not at all. Raises BuildError."""
-    compiler = _compiler()
+    command = compiler()
     tuning = '-march=native' if platform.machine() in ('x86_64', 'AMD64', 'i686') else '-mcpu=native'
     temporary = target.with_name(f'.{target.name}.{os.getpid()}')
-    command = [*compiler, *_FLAGS, tuning, *flags, str(SOURCE), '-o', str(temporary), '-lm']
+    command += [*_FLAGS, tuning, *flags, str(SOURCE), '-o', str(temporary), '-lm']
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL)
         if result.returncode:
             raise BuildError(f'{shlex.join(command)} failed: {result.stderr.strip()[:500]}')
         os.replace(temporary, target)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise BuildError(f'{compiler[0]}: {error}') from error
+        raise BuildError(f'{command[0]}: {error}') from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -79,8 +79,8 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _compiler() -> list[str]:
-    """Command of the C compiler: $CC, or the first there is."""
+def compiler() -> list[str]:
+    """Command of the C compiler: $CC, or the first there is. Raises BuildError."""
     named = shlex.split(os.environ.get('CC', ''))
     for candidate in [named] if named else [['cc'], ['gcc'], ['clang']]:
         if shutil.which(candidate[0]):
