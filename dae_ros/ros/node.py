@@ -27,7 +27,7 @@ from rclpy.timer import Timer
 from dae_ros.command import refuse
 from dae_ros.config import SettingInfo
 from dae_ros.errors import DaeRosError, Refused
-from dae_ros.ros import names, params, qos
+from dae_ros.ros import names, params, qos, shared_memory
 from dae_ros.ros.clock_watch import ClockWatch
 
 try:
@@ -209,6 +209,7 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
     signal.signal(signal.SIGINT, interrupt)  # rclpy's handler, which shuts the context down, calls this one
     try:
         try:
+            shared_memory.remove_half_made_ports()
             rclpy.init(args=args)
             nodes += make_nodes()
             executor = Executor()

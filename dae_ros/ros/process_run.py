@@ -46,6 +46,7 @@ class ProcessRun:
         """Returns when the run is finished. Raises DaeRosError when it cannot go on; no process is left either way."""
         os.environ.update(node_environment())  # for this process too: it must hear the others
         enclave = enclave_arguments('bringup', self._namespace)
+        shared_memory.remove_half_made_ports()
         rclpy.init(args=['--ros-args', *enclave], signal_handler_options=SignalHandlerOptions.NO)
         node = rclpy.create_node('bringup', namespace=self._namespace, start_parameter_services=False)
         self._process_of = {f'{node.get_namespace().rstrip("/")}/{name}': process.name
