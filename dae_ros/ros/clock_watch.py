@@ -16,9 +16,9 @@ JUMP = 0.2    # s; clocks that are only being corrected drift apart by less in t
 
 
 class ClockWatch:
-    """Calls `on_set`, in a thread of its own, whenever the clock was set, until it is closed."""
+    """Calls `on_set` with the seconds that the clock was set forward by, in a thread of its own, until it is closed."""
 
-    def __init__(self, on_set: Callable[[], None]):
+    def __init__(self, on_set: Callable[[float], None]):
         self._on_set = on_set
         self._ending, self._end = os.pipe()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -29,7 +29,7 @@ class ClockWatch:
         while not select.select([self._ending], [], [], GLANCE)[0]:  # the wait of a lock may hang on the clock itself
             now = _ahead()
             if abs(now - before) > JUMP:
-                self._on_set()
+                self._on_set(now - before)
             before = now
 
     def close(self) -> None:

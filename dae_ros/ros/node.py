@@ -219,7 +219,7 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
             # again, a quarter of an agent's time, since every message makes a few objects.
             gc.collect()
             gc.freeze()
-            watch = ClockWatch(lambda: set_timers_anew(nodes))
+            watch = ClockWatch(lambda _: set_timers_anew(nodes))
             while rclpy.ok():
                 executor.spin_once(LONG)
                 for node in nodes:

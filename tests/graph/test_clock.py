@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 import struct
 import subprocess
 import time
@@ -10,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import REPOSITORY, SMALL, TIMEOUT, Listener, bringup, finish, oracle
+from harness import REPOSITORY, SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of
 from test_parameters import start
 
 from dae_ros import config
@@ -75,9 +77,18 @@ def host_clock(tmp_path, monkeypatch):
     return HostClock(library, tmp_path / 'offset', monkeypatch)
 
 
-def test_a_training_goes_on_to_the_same_weights_when_the_clock_is_set_back_and_forward_by_an_hour(domain, host_clock, tmp_path):
-    values = {**SMALL, 'total_steps': 80 * 8 * 25, 'rollout_timeout': 60.0}
-    settings = config.from_flat(values)
+VALUES = {**SMALL, 'total_steps': 80 * 8 * 25, 'rollout_timeout': 60.0}
+
+
+@pytest.fixture(scope='module')
+def expected(tmp_path_factory):
+    return oracle(tmp_path_factory.mktemp('alone') / 'run', VALUES)
+
+
+@pytest.mark.parametrize('killed', [None, 'agents_0-2'])
+def test_a_training_goes_on_to_the_same_weights_when_the_clock_is_set_back_by_an_hour_and_then_right(
+        killed, domain, host_clock, expected, tmp_path):
+    settings = config.from_flat(VALUES)
     folder = RunFolder(tmp_path / 'run', settings)
     nodes = {f'/{node}' for process in training_graph(settings, folder) for node in process.nodes}
     shown: dict[str, int] = {}  # hours that a node's clock is off
@@ -85,7 +96,7 @@ def test_a_training_goes_on_to_the_same_weights_when_the_clock_is_set_back_and_f
     def hear(report: DiagnosticArray) -> None:
         shown[report.status[0].name] = round((report.header.stamp.sec - time.time()) / HOUR)
 
-    process = bringup(folder.path, values)
+    process = bringup(folder.path, VALUES)
     try:
         with Listener() as listener:
             listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, hear, qos.EVENTS)
@@ -94,12 +105,18 @@ def test_a_training_goes_on_to_the_same_weights_when_the_clock_is_set_back_and_f
             for hours in (-1, 0):
                 host_clock.set(hours * HOUR)
                 listener.spin_until(lambda: shown == dict.fromkeys(nodes, hours), lambda: str(shown))
+                if killed and hours:
+                    os.kill(pid_of(killed, folder.path), signal.SIGKILL)
+                    version = max(int(path.stem[-8:]) for path in folder.checkpoints.iterdir())
+                    listener.wait_for_status(lambda status: status.policy_version >= version + 5)
         code, output, errors = finish(process)
     finally:
+        host_clock.set(0)
         process.kill()
     assert code == 0, output + errors
     summary = Summary.read(folder.summary_file)
-    assert (summary.weights_sha256, summary.evaluation_return) == oracle(tmp_path / 'alone', values)
-    assert (folder.path / 'attempts').read_text() == attempts, 'a rollout was begun anew'
-    assert 'is killed' not in output and 'started again' not in output
+    assert (summary.weights_sha256, summary.evaluation_return) == expected
+    assert 'is killed' not in output
+    assert killed or 'started again' not in output
+    assert killed or (folder.path / 'attempts').read_text() == attempts, 'a rollout was begun anew'
     assert not any('Traceback' in text for text in (output, errors, *(log.read_text() for log in folder.path.glob('logs/*'))))
