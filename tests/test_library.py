@@ -27,7 +27,7 @@ def answer(code=ASK, **environment):
 def quick_compiler(tmp_path):
     """A C compiler that does not optimise, and writes down each call."""
     path = tmp_path / 'cc'
-    path.write_text(f'#!/bin/sh\necho called >>{path}.log\nexec {shlex.join(build._compiler())} "$@" -O0\n')
+    path.write_text(f'#!/bin/sh\necho called >>{path}.log\nexec {shlex.join(build.compiler())} "$@" -O0\n')
     path.chmod(0o755)
     return str(path)
 
