@@ -50,7 +50,7 @@ class RobotBridgeNode(TeamNode):
             self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
         self.listen(msg.Action, names.ACTION.format(robot), qos.EVENTS, self._on_action)
         self.create_service(SetBool, names.ENABLE, self._on_enable)
-        self.every(1.0 / (LOOKS * settings['control_rate']), self._look)
+        self.as_time_goes_on(1.0 / (LOOKS * settings['control_rate']), self._look)
 
     def end(self) -> None:
         """Tells the robot to stand, as the last thing said; from whichever thread ends the node."""

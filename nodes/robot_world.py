@@ -9,8 +9,6 @@ from functools import partial
 
 from geometry_msgs.msg import PoseArray, TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock as SystemClock
-from rclpy.clock import ClockType
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -43,7 +41,7 @@ class RobotWorldNode(TeamNode):
         self._bodies = Bodies(task, self._frame, limits_in(settings), settings['drive'] == 'differential', settings['seed'])
         self._episode, self._period = 0, 1.0 / settings['odometry_rate']
         self._is_clock = settings['real_time_factor'] != 1.0
-        self._time, self._shown = BEGINNING, 0.0
+        self._time = BEGINNING
         command = TwistStamped if settings['stamped'] else Twist
         self._odometry = [self.publisher(Odometry, names.ODOMETRY.format(i), qos.NEWEST) for i in robots]
         self._landmarks = self.publisher(PoseArray, names.LANDMARKS, qos.LATCHED)
@@ -56,8 +54,8 @@ class RobotWorldNode(TeamNode):
         listen_for(self, self._scene)
         self.create_service(Trigger, names.NEXT_EPISODE, self._on_next_episode)
         self._show_landmarks()
-        steady = SystemClock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(self._period / settings['real_time_factor'], self._guarded(self._tick), clock=steady)
+        self.every(MARKERS_PERIOD, self._show)
+        self.every(self._period / settings['real_time_factor'], self._tick)
 
     def now(self) -> float:
         return self._time if self._is_clock else super().now()
@@ -86,18 +84,18 @@ class RobotWorldNode(TeamNode):
             if episode != self._episode:
                 self._begin(episode)
         self._bodies.move(now, self._period)
-        if self._is_clock:
-            self._clock_out.publish(Clock(clock=convert_robots.time_message(now)))
         for robot, publisher in enumerate(self._odometry):
             publisher.publish(convert_robots.odometry_message(self._bodies.pose(robot, now), float(self._bodies.turns[robot]),
                                                               self._world_frame, self._body_frame(robot)))
         if self._transforms:
             self._transforms.publish(TFMessage(transforms=[self._transform(robot, now) for robot in range(len(self._odometry))]))
-        if not 0.0 <= now - self._shown < MARKERS_PERIOD:
-            self._shown = now
-            bodies = self._bodies
-            self._scene.show(bodies.positions, bodies.headings, bodies.landmarks, bodies.targets)
-            self._markers.publish(markers(self._scene, now, self._world_frame))
+        if self._is_clock:  # last, so that with each moment all is known of it
+            self._clock_out.publish(Clock(clock=convert_robots.time_message(now)))
+
+    def _show(self) -> None:
+        bodies = self._bodies
+        self._scene.show(bodies.positions, bodies.headings, bodies.landmarks, bodies.targets)
+        self._markers.publish(markers(self._scene, self.now(), self._world_frame))
 
     def _body_frame(self, robot: int) -> str:
         """Two teams have frames of their own, as they have topics of their own."""

@@ -36,7 +36,7 @@ class TaskMonitorNode(TeamNode):
         for robot in range(settings['num_agents']):
             self.listen(Odometry, names.ODOMETRY.format(robot), qos.SENSOR, partial(self._on_odometry, robot))
         self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
-        self.every(1.0 / (LOOKS * settings['control_rate']), self._look)
+        self.as_time_goes_on(1.0 / (LOOKS * settings['control_rate']), self._look)
         self._scene = Scene(settings['num_agents'], self._watch.radius)
         self._markers = self.publisher(MarkerArray, names.MARKERS, qos.NEWEST)
         listen_for(self, self._scene)
