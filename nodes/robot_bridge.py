@@ -21,7 +21,7 @@ from dae_ros.config import AgentSettings, BodySettings, BridgeSettings, RunBindi
 from dae_ros.errors import Refused, SettingsError
 from dae_ros.robots import standard_messages
 from dae_ros.robots.motion import STOP, Command
-from dae_ros.robots.pilot import LOOKS, Turn
+from dae_ros.robots.pilot import LOOKS, Turn, without
 from dae_ros.robots.safety import Stop
 from dae_ros.robots.setup import landmarks_in, make_pilot
 from dae_ros.ros import convert, convert_robots, names, qos
@@ -106,8 +106,11 @@ class RobotBridgeNode(TeamNode):
 
     def diagnose(self):
         stop, values = self._pilot.stop, {'robot': self.settings['robot'], 'enabled': self._pilot.enabled}
-        self.is_in_trouble = stop is not None and stop.reason != Stop.DISABLED
-        return ('driving', values) if stop is None else (f'standing: {stop.detail}', {**values, 'standing for': stop.reason})
+        lost = self._pilot.lost(self.now())
+        self.is_in_trouble = bool(lost) if stop is None else stop.reason != Stop.DISABLED
+        if stop is None:
+            return f'driving{without(lost)}', values
+        return f'standing: {stop.detail}', {**values, 'standing for': stop.reason}
 
     def close(self) -> None:
         if self.context.ok():

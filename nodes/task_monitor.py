@@ -15,7 +15,7 @@ from visualization_msgs.msg import MarkerArray
 
 from dae_ros.config import BodySettings, BridgeSettings, RunBinding, TaskSettings, declarations
 from dae_ros.robots import standard_messages
-from dae_ros.robots.pilot import LOOKS
+from dae_ros.robots.pilot import LOOKS, without
 from dae_ros.robots.scene import Scene
 from dae_ros.robots.setup import make_watch
 from dae_ros.ros import convert, names, qos
@@ -61,13 +61,14 @@ class TaskMonitorNode(TeamNode):
         """Shows the team, unless our simulator plays it and does so itself."""
         now = self.now()
         if not self._watch.blind_for(now) and self.count_publishers(names.MARKERS) == 1:
-            self._watch.show(self._scene)
+            self._watch.show(self._scene, now)
             self._markers.publish(markers(self._scene, now, self._world_frame))
 
     def diagnose(self):
-        blind = self._watch.blind_for(self.now())
-        self.is_in_trouble = bool(blind)
-        return f'waiting for {blind}' if blind else 'watching', {}
+        now = self.now()
+        blind, lost = self._watch.blind_for(now), self._watch.lost(now)
+        self.is_in_trouble = bool(blind or lost)
+        return f'waiting for {blind}' if blind else f'watching{without(lost)}', {}
 
 
 def main(args: list[str] | None = None) -> int:

@@ -35,6 +35,11 @@ def stamp_at(now: float, period: float, episode_steps: int, run: int) -> Stamp:
     return Stamp(run, episode % LARGEST_ROLLOUT, 0, step)
 
 
+def without(robots: list[int]) -> str:
+    """Who is missed, for people: the end of a sentence."""
+    return f' without robot {", ".join(map(str, robots))}' if robots else ''
+
+
 class Pilot:
     """Drives one robot as its agent says, or lets it stand and knows why."""
 
@@ -51,6 +56,10 @@ class Pilot:
     @property
     def enabled(self) -> bool:
         return self._safety.enabled
+
+    def lost(self, now: float) -> list[int]:
+        """Team mates that are heard of no more."""
+        return self._safety.lost(now)
 
     def enable(self, enabled: bool) -> None:
         """Lets the robot move, or not."""
@@ -101,7 +110,7 @@ class Pilot:
         return self._motion.act(int(action.actions[0]), self._safety.tracks[self._robot].pose.heading)
 
     def _observe(self, step: Stamp, now: float) -> Observation:
-        poses = [track.pose for track in self._safety.tracks]
+        poses = [track.held(now) for track in self._safety.tracks]
         sight = self._monitor.see(self._frame.positions([pose.position for pose in poses]),
                                   self._frame.velocities([pose.velocity for pose in poses]),
                                   self._frame.positions(self._landmarks))

@@ -63,12 +63,13 @@ class Processes:
 
 
 class Stage(Listener):
-    """The clock, three robots that stand where they are put, and everything that is said to and about them."""
+    """The clock, robots that stand where they are put, and everything that is said to and about them."""
 
-    def __init__(self, command: type = Twist):
+    def __init__(self, command: type = Twist, places: np.ndarray = PLACES):
         super().__init__()
         self.now = BEGINNING
-        self.places = PLACES.copy()
+        self.places = places.copy()
+        self.robots = range(len(places))
         self.commands: dict[int, list] = defaultdict(list)
         self.observations: dict[int, list] = defaultdict(list)
         self.actions: dict[int, list] = defaultdict(list)
@@ -76,8 +77,8 @@ class Stage(Listener):
         node = self.node
         self.clock = node.create_publisher(Clock, '/clock', 10)
         self.landmarks = node.create_publisher(PoseArray, names.LANDMARKS, qos.LATCHED)
-        self.odometry = [node.create_publisher(Odometry, names.ODOMETRY.format(robot), 10) for robot in range(3)]
-        for robot in range(3):
+        self.odometry = [node.create_publisher(Odometry, names.ODOMETRY.format(robot), 10) for robot in self.robots]
+        for robot in self.robots:
             for kind, topic, profile, heard in ((command, names.COMMAND, 10, self.commands),
                                                 (msg.Observation, names.OBSERVATION, qos.LATCHED_INPUT, self.observations),
                                                 (msg.Action, names.ACTION, qos.ROLLOUT, self.actions)):
@@ -92,12 +93,12 @@ class Stage(Listener):
         for status in message.status:
             self.diagnostics[status.name.strip('/')].append(status.message)
 
-    def wait_for_bridges(self, number: int) -> None:
+    def wait_for_bridges(self, number: int, landmarks: np.ndarray = LANDMARKS) -> None:
         """Shows the landmarks, and waits until bridges hear and are heard."""
-        self.landmarks.publish(convert_robots.landmarks_message(LANDMARKS, self.now, FRAME))
+        self.landmarks.publish(convert_robots.landmarks_message(landmarks, self.now, FRAME))
         self.spin_until(lambda: all(publisher.get_subscription_count() >= number for publisher in self.odometry))
         self.spin_until(lambda: self.clock.get_subscription_count() >= number)
-        self.spin_until(lambda: sum(self.node.count_publishers(names.COMMAND.format(robot)) for robot in range(3)) >= number)
+        self.spin_until(lambda: sum(self.node.count_publishers(names.COMMAND.format(robot)) for robot in self.robots) >= number)
 
     def show(self, robot: int, **changes) -> None:
         """Publishes the odometry of one robot, with fields of its pose changed."""
