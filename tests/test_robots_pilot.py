@@ -240,3 +240,19 @@ def test_where_it_goes_on_without_lost_team_mates_it_has_met_all_of_them_once():
     assert team.pilot.lost(team.now) == [1] and team.pilot.lost(team.now - 2.5) == []
     team.step(1)
     assert team.step(1)[0] == (STOP, None)  # its own odometry it cannot do without
+
+
+def test_a_late_answer_counts_within_the_timeout_and_not_once_a_later_one_came():
+    team = Team()
+    first, second, third, fourth = (team.step(0, 1, answers=False)[0].observation for _ in range(4))
+    assert [one.episode_start[0] for one in (first, second, third)] == [True, False, False]
+    for late in (answer(first), answer(second)._replace(robot=1)):  # 0.3 s old
+        with pytest.raises(Refused):
+            team.pilot.on_action(late)
+    assert team.pilot.stop.reason == 'agent'
+    assert team.pilot.on_action(answer(third)).forward > 0.0
+    with pytest.raises(Refused):
+        team.pilot.on_action(answer(second))
+    team.pilot.on_action(answer(fourth))
+    turn, _ = team.step(0, 1)
+    assert team.pilot.stop is None and not turn.observation.episode_start[0]

@@ -86,9 +86,13 @@ class Safety:
         if self._unanswered_since is None:
             self._unanswered_since = now
 
-    def answered(self) -> None:
-        """The agent acted on the last observation."""
-        self._unanswered_since = None
+    def answered(self, since: float | None) -> None:
+        """The agent acted; the first observation that it has not acted on yet is of `since` [s], None if there is none."""
+        self._unanswered_since = since
+
+    def waits(self, asked: float, now: float) -> bool:
+        """Whether the agent may still answer at `now` what it was asked then."""
+        return 0.0 <= now - asked <= self._bounds.action_timeout
 
     def stop(self, now: float) -> Stop | None:
         """Why the robot must stand now; None if it may move. Whoever stands for another reason owes no answer."""

@@ -103,10 +103,11 @@ class TeamNode(Node):
         """A timer that calls `act` each `period` seconds, whatever becomes of the host's clock or of simulated time."""
         return self.create_timer(period, self._guarded(act), clock=STEADY)
 
-    def as_time_goes_on(self, period: float, act: Callable[[], None]) -> None:
+    def as_time_goes_on(self, period: float, act: Callable[[], None], profile: QoSProfile) -> None:
         """Calls `act` each `period` seconds, or where time is simulated with each message of its clock, once there are any.
 
-        Of simulated time no moment is passed over then, however much faster than ours it runs, and `now` is the one at hand.
+        So no moment is passed over, however much faster than ours it runs. `now` is then the one at hand; `profile` says whether
+        each counts or the newest.
         """
         def on_clock(message: ClockMessage) -> None:
             self._moment = seconds(message.clock)
@@ -119,7 +120,7 @@ class TeamNode(Node):
         self.every(period, on_timer)
         if self.get_parameter('use_sim_time').value:
             self._moment = 0.0
-            self.listen(ClockMessage, names.CLOCK, qos.CLOCK, on_clock)
+            self.listen(ClockMessage, names.CLOCK, profile, on_clock)
 
     def create_service(self, srv_type: type, srv_name: str, callback: Callable, **options) -> Service:
         """A service. Those with which rclpy lets anyone change parameters refuse: it would fall over a value of an unknown type,

@@ -9,7 +9,6 @@ from robots import Stage, is_standing
 
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.execution import streaming_graph
-from dae_ros.ros.graph import NodeProcess
 
 STEPS, LOST = 10, 3
 PLACES = np.array([[0.0, 0.0], [0.9, -0.2], [-0.3, 0.8], [-0.9, -0.9], [0.8, 0.9]])
@@ -17,19 +16,17 @@ LANDMARKS = 0.5 * PLACES[::-1]
 OTHERS = tuple(robot for robot in range(5) if robot != LOST)
 EVERYBODY = range(5)
 VALUES = {'num_agents': 5, 'episode_steps': STEPS, 'num_steps': STEPS, 'num_worlds': 2, 'total_steps': 10**6, 'epochs': 1,
-          'hidden_size': 16, 'reward_network.epochs': 1, 'reward_network.hidden_size': 16, 'evaluation_greedy': False}
+          'hidden_size': 16, 'reward_network.epochs': 1, 'reward_network.hidden_size': 16, 'evaluation_greedy': False,
+          'robots_per_process': 1}
 ON_ROBOTS = {'real_time_factor': 2.0, 'drive': 'holonomic', 'on_lost_team_mate': 'go_on', 'max_staleness': 5}
 
 
 @pytest.fixture
 def graph(make_graph, tmp_path):
-    """A team that learns in a stream, whose clock and bodies are the test's. The agents share a process."""
+    """A team that learns in a stream, a process for each robot; the clock and the bodies are the test's."""
     graph = make_graph(tmp_path / 'run', VALUES)
-    processes = {process.name: process for process in streaming_graph(graph.settings, {**VALUES, **ON_ROBOTS}, graph.folder, True)
-                 if process.executable not in ('world', 'agent')}
-    agents = NodeProcess('agent', 'agents', {'run': graph.folder.run, 'execute': True, 'greedy': False, 'robots': 5},
-                         tuple(f'agent_{robot}' for robot in EVERYBODY))
-    graph.processes = {**processes, 'agents': agents}
+    processes = streaming_graph(graph.settings, {**VALUES, **ON_ROBOTS}, graph.folder, simulate=True)
+    graph.processes = {process.name: process for process in processes if process.name != 'world'}
     return graph
 
 
@@ -73,7 +70,7 @@ def test_four_of_five_robots_drive_and_learn_on_when_one_is_killed_and_it_is_tak
 
         while convert.action(stage.actions[0][-1]).stamp.step != STEPS // 2:  # in the middle of an episode
             stage.drive(0, *EVERYBODY)
-        graph.kill(f'bridge_{LOST}')
+        graph.kill(f'robots_{LOST}-{LOST}')
         version = told.version
         drive_on(stage, OTHERS, OTHERS, lambda: told.version >= version + 2)
         assert not any(is_standing(stage.commands[robot][-1]) for robot in OTHERS)
@@ -82,15 +79,15 @@ def test_four_of_five_robots_drive_and_learn_on_when_one_is_killed_and_it_is_tak
         np.testing.assert_allclose(seen[14:22].reshape(4, 2)[LOST - 1], PLACES[LOST] - PLACES[0], atol=1e-6)
         assert any(f'without robot {LOST}' in line for line in stage.diagnostics['bridge_0'])
 
-        version = told.version  # its odometry is there again, its bridge is not
+        version = told.version  # its odometry is there again, its bridge and its agent are not
         drive_on(stage, OTHERS, EVERYBODY, lambda: told.version >= version + 2)
         assert told.absent == set()
 
-        graph.start(f'bridge_{LOST}')
+        graph.start(f'robots_{LOST}-{LOST}')
         acted = len(stage.actions[LOST])
         stage.tick_until(lambda: len(stage.actions[LOST]) > acted, *EVERYBODY)
         version = told.version
         drive_on(stage, EVERYBODY, EVERYBODY, lambda: told.version >= version + 2)
         assert not is_standing(stage.commands[LOST][-1])
-    for name in ('task_monitor', 'trainer', 'agents', 'bridge_0'):
+    for name in ('task_monitor', 'trainer', 'robots_0-0'):
         assert 'Traceback' not in graph.log(name), graph.log(name)
