@@ -45,14 +45,14 @@ class RobotBridgeNode(TeamNode):
         self._commands = self.publisher(TwistStamped if self._stamped else Twist, names.COMMAND.format(robot), qos.NEWEST)
         self._observations = self.publisher(msg.Observation, names.OBSERVATION.format(robot), qos.LATCHED)
         for other in range(settings['num_agents']):
-            self.listen(Odometry, names.ODOMETRY.format(other), qos.SENSOR, partial(self._on_odometry, other), raw=True)
+            self.listen(Odometry, names.ODOMETRY.format(other), qos.NOW, partial(self._on_odometry, other), raw=True)
         if settings['landmarks']:
             self._take_landmarks(settings['landmarks'])
         else:
             self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
         self.listen(msg.Action, names.ACTION.format(robot), qos.EVENTS, self._on_action)
         self.create_service(SetBool, names.ENABLE, self._on_enable)
-        self.as_time_goes_on(1.0 / (LOOKS * settings['control_rate']), self._look, qos.CLOCK)
+        self.as_time_goes_on(1.0 / (LOOKS * settings['control_rate']), self._look, qos.NOW)
 
     def end(self) -> None:
         """Tells the robot to stand, as the last thing said; from whichever thread ends the node."""

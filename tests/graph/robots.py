@@ -9,7 +9,7 @@ import time
 from collections import defaultdict
 from functools import partial
 from pathlib import Path
-from typing import Callable
+from typing import Callable, Iterable
 
 import numpy as np
 from dae_ros_msgs import msg
@@ -26,6 +26,7 @@ from dae_ros.ros.supervisor import Supervisor
 POLICY = REPOSITORY / 'config' / 'policies' / 'navigation.safetensors'
 BEGINNING = 1000.0  # s
 PERIOD = 0.1        # s
+PATIENCE = 2.0      # s of ours
 FRAME = 'map'
 LANDMARKS = np.array([[0.5, 0.5], [-0.5, 0.0], [0.2, -0.6]])
 PLACES = np.array([[0.0, 0.0], [0.9, -0.2], [-0.3, 0.8]])
@@ -118,6 +119,19 @@ class Stage(Listener):
         self.tick(*shown)
         self.spin_until(lambda: len(self.commands[robot]) > count, lambda: f'no command; {self.diagnostics}')
         return self.commands[robot][-1]
+
+    def step(self, robots: Iterable[int], *shown: int) -> None:
+        """A tick in which these robots act. One that passes it over, since it was too busy, has to act in a later one."""
+        counts = {robot: len(self.actions[robot]) for robot in robots}
+        deadline = time.monotonic() + TIMEOUT
+
+        def have_acted() -> bool:
+            return all(len(self.actions[robot]) > count for robot, count in counts.items())
+
+        while not have_acted():
+            assert time.monotonic() < deadline, {name: said[-1] for name, said in self.diagnostics.items()}
+            self.tick(*shown)
+            self._holds_within(PATIENCE, have_acted)
 
     def tick_until(self, condition: Callable[[], bool], *shown: int) -> None:
         """Lets the clock go on, ten times as fast as at most, until `condition` holds; AssertionError if it never does."""

@@ -130,12 +130,8 @@ def test_what_robots_do_does_not_change_when_trainer_and_parameter_server_are_ki
     for robot in everybody:
         stage.start_driving(robot, *everybody)
     graph.kill('trainer', 'parameter_server')
-    before = [len(stage.actions[robot]) for robot in everybody]
     for _ in range(40):  # more than an episode
-        stage.tick(*everybody)
-        for robot, count in enumerate(before):
-            stage.spin_until(lambda: len(stage.actions[robot]) > count)
-        before = [len(stage.actions[robot]) for robot in everybody]
+        stage.step(everybody, *everybody)
     policy, = (decode_policy(path.read_bytes()) for path in graph.folder.policies.glob('*/policy_*.safetensors'))
     for robot in everybody:
         acted, seen = stage.decoded(stage.actions[robot]), {item.stamp: item for item in stage.decoded(stage.observations[robot])}
