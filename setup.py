@@ -4,7 +4,7 @@ from glob import glob
 from setuptools import find_packages, setup
 
 EXECUTABLES = ('agent', 'bringup', 'credit', 'export_policy', 'parameter_server', 'player', 'recorder', 'replay_trainer',
-               'robot_bridge', 'stream_trainer', 'task_monitor', 'train_reward', 'trainer', 'world')
+               'robot', 'robot_bridge', 'stream_trainer', 'task_monitor', 'train_reward', 'trainer', 'world')
 
 setup(
     name='dae_ros',

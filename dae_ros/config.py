@@ -233,8 +233,10 @@ class BridgeSettings:
     landmarks: str = setting('', 'where the landmarks are, "x y, x y, ..." in m; empty takes the topic')
     odometry_timeout: float = setting(0.15, 'the robot stops when its own odometry is older', unit='s', minimum=1e-3,
                                       maximum=60.0)
-    teammate_hold: float = setting(1.0, 'a team mate counts as where it was last for so long; then the robot stops', unit='s',
+    teammate_hold: float = setting(1.0, 'a team mate that falls silent counts as where it was last for so long', unit='s',
                                    minimum=1e-3, maximum=3600.0)
+    on_lost_team_mate: str = setting('stop', 'when a team mate has not been heard of for teammate_hold: stop until it is '
+                                             'back, or go on with it where it was last', choices=('stop', 'go_on'))
     action_timeout: float = setting(0.25, 'the robot stops when its agent does not answer for longer', unit='s', minimum=1e-3,
                                     maximum=60.0)
     jump_distance: float = setting(0.3, 'odometry further than this from where the robot can be at jump_speed is refused',

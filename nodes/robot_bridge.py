@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from functools import partial
+from typing import Callable
 
 import rclpy
 from dae_ros_msgs import msg
@@ -21,20 +22,21 @@ from dae_ros.config import AgentSettings, BodySettings, BridgeSettings, RunBindi
 from dae_ros.errors import Refused, SettingsError
 from dae_ros.robots import standard_messages
 from dae_ros.robots.motion import STOP, Command
-from dae_ros.robots.pilot import LOOKS, Turn
+from dae_ros.robots.pilot import LOOKS, Turn, without
 from dae_ros.robots.safety import Stop
 from dae_ros.robots.setup import landmarks_in, make_pilot
 from dae_ros.ros import convert, convert_robots, names, qos
-from dae_ros.ros.node import TeamNode, run
+from dae_ros.ros.node import TeamNode, run_together
 
+DECLARED = [*declarations(AgentSettings, TaskSettings, BodySettings, BridgeSettings, RunBinding)]
 LAST_WORD = Duration(seconds=0.5)  # for the last command to arrive
 
 
 class RobotBridgeNode(TeamNode):
     """Wires a `Pilot` to the topics of its robot and the team's odometry."""
 
-    def __init__(self):
-        super().__init__('robot_bridge', declarations(AgentSettings, TaskSettings, BodySettings, BridgeSettings, RunBinding))
+    def __init__(self, name: str = 'robot_bridge', **given: int):
+        super().__init__(name, DECLARED, **given)
         settings = self.settings
         robot, self._world_frame, self._stamped = settings['robot'], settings['world_frame'], settings['stamped']
         self._body_frame = ''
@@ -43,14 +45,14 @@ class RobotBridgeNode(TeamNode):
         self._commands = self.publisher(TwistStamped if self._stamped else Twist, names.COMMAND.format(robot), qos.NEWEST)
         self._observations = self.publisher(msg.Observation, names.OBSERVATION.format(robot), qos.LATCHED)
         for other in range(settings['num_agents']):
-            self.listen(Odometry, names.ODOMETRY.format(other), qos.SENSOR, partial(self._on_odometry, other))
+            self.listen(Odometry, names.ODOMETRY.format(other), qos.NOW, partial(self._on_odometry, other), raw=True)
         if settings['landmarks']:
             self._take_landmarks(settings['landmarks'])
         else:
             self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
         self.listen(msg.Action, names.ACTION.format(robot), qos.EVENTS, self._on_action)
         self.create_service(SetBool, names.ENABLE, self._on_enable)
-        self.every(1.0 / (LOOKS * settings['control_rate']), self._look)
+        self.as_time_goes_on(1.0 / (LOOKS * settings['control_rate']), self._look, qos.NOW)
 
     def end(self) -> None:
         """Tells the robot to stand, as the last thing said; from whichever thread ends the node."""
@@ -59,13 +61,14 @@ class RobotBridgeNode(TeamNode):
             self._ended = True
         self._commands.wait_for_all_acked(LAST_WORD)
 
-    def _on_odometry(self, robot: int, message: Odometry) -> None:
+    def _on_odometry(self, robot: int, data: bytes) -> None:
         now = self.now()
         if now == 0.0:  # simulated time has not begun
             return
-        self._pilot.on_odometry(robot, standard_messages.odometry(message, self._world_frame), now)
+        pose, body_frame = standard_messages.odometry_in(data, self._world_frame)
+        self._pilot.on_odometry(robot, pose, now)
         if robot == self.settings['robot']:
-            self._body_frame = message.child_frame_id
+            self._body_frame = body_frame
 
     def _on_landmarks(self, message: PoseArray) -> None:
         self._pilot.on_landmarks(standard_messages.landmarks(message, self._world_frame))
@@ -106,31 +109,41 @@ class RobotBridgeNode(TeamNode):
 
     def diagnose(self):
         stop, values = self._pilot.stop, {'robot': self.settings['robot'], 'enabled': self._pilot.enabled}
-        self.is_in_trouble = stop is not None and stop.reason != Stop.DISABLED
-        return ('driving', values) if stop is None else (f'standing: {stop.detail}', {**values, 'standing for': stop.reason})
+        lost = self._pilot.lost(self.now())
+        self.is_in_trouble = bool(lost) if stop is None else stop.reason != Stop.DISABLED
+        if stop is None:
+            return f'driving{without(lost)}', values
+        return f'standing: {stop.detail}', {**values, 'standing for': stop.reason}
 
     def close(self) -> None:
         if self.context.ok():
             self.end()
 
 
-def main(args: list[str] | None = None) -> int:
-    """Runs the bridge. Signals end it through a thread of its own, since a context that a signal shut down sends nothing more."""
-    nodes: list[RobotBridgeNode] = []
+def run_robots(make_nodes: Callable[[], list[TeamNode]], args: list[str] | None = None) -> int:
+    """Runs bridges, and whatever shares their process. Signals end them through a thread of its own, since a context that a
+    signal shut down sends nothing more."""
+    nodes: list[TeamNode] = []
     endings = {signal.SIGINT, signal.SIGTERM}
     signal.pthread_sigmask(signal.SIG_BLOCK, endings)
 
-    def make() -> RobotBridgeNode:
-        nodes.append(RobotBridgeNode())
+    def make() -> list[TeamNode]:
+        nodes.extend(make_nodes())
         threading.Thread(target=end_on_signal, daemon=True).start()
-        return nodes[0]
+        return nodes
 
     def end_on_signal() -> None:
         signal.sigwait(endings)
-        nodes[0].end()
+        for node in nodes:
+            if isinstance(node, RobotBridgeNode):
+                node.end()
         rclpy.try_shutdown()
 
-    return run(make, args)
+    return run_together(make, args)
+
+
+def main(args: list[str] | None = None) -> int:
+    return run_robots(lambda: [RobotBridgeNode()], args)
 
 
 if __name__ == '__main__':

@@ -5,12 +5,11 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 
 from geometry_msgs.msg import PoseArray, TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock as SystemClock
-from rclpy.clock import ClockType
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -18,6 +17,7 @@ from visualization_msgs.msg import MarkerArray
 from dae_ros.config import SETTINGS, BodySettings, RobotWorldSettings, TaskSettings, declarations
 from dae_ros.robots import standard_messages
 from dae_ros.robots.bodies import Bodies
+from dae_ros.robots.pace import Pace
 from dae_ros.robots.pilot import stamp_at
 from dae_ros.robots.scene import Scene
 from dae_ros.robots.setup import limits_in, task_frame, task_settings
@@ -34,7 +34,7 @@ BEGINNING = 1.0  # s, where a clock of our own begins
 
 
 class RobotWorldNode(TeamNode):
-    """Wires `Bodies` to the topics of robots. At real time it goes by the system's clock, else it is the clock."""
+    """Wires `Bodies` to the topics of robots. At real time it goes by the system's clock, else it is the clock, at its `Pace`."""
 
     def __init__(self):
         super().__init__('world', [*declarations(TaskSettings, BodySettings, RobotWorldSettings), SETTINGS['seed']])
@@ -43,7 +43,8 @@ class RobotWorldNode(TeamNode):
         self._bodies = Bodies(task, self._frame, limits_in(settings), settings['drive'] == 'differential', settings['seed'])
         self._episode, self._period = 0, 1.0 / settings['odometry_rate']
         self._is_clock = settings['real_time_factor'] != 1.0
-        self._time, self._shown = BEGINNING, 0.0
+        self._time, self._overdue = BEGINNING, False
+        self._pace = Pace(self._bodies, self._period, 1.0 / settings['control_rate'])
         command = TwistStamped if settings['stamped'] else Twist
         self._odometry = [self.publisher(Odometry, names.ODOMETRY.format(i), qos.NEWEST) for i in robots]
         self._landmarks = self.publisher(PoseArray, names.LANDMARKS, qos.LATCHED)
@@ -53,17 +54,20 @@ class RobotWorldNode(TeamNode):
         self._transforms = TFMessage and self.publisher(TFMessage, names.TRANSFORMS, qos.EVENTS)
         for i in robots:
             self.listen(command, names.COMMAND.format(i), qos.SENSOR, partial(self._on_command, i))
-        listen_for(self, self._scene)
+        self._watched = False  # whether anybody ever was shown the team
         self.create_service(Trigger, names.NEXT_EPISODE, self._on_next_episode)
         self._show_landmarks()
-        steady = SystemClock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(self._period / settings['real_time_factor'], self._guarded(self._tick), clock=steady)
+        self.every(MARKERS_PERIOD, self._show)
+        self.every(self._period / settings['real_time_factor'], self._tick)
 
     def now(self) -> float:
         return self._time if self._is_clock else super().now()
 
     def _on_command(self, robot: int, message: Twist | TwistStamped) -> None:
         self._bodies.obey(robot, standard_messages.command(message), self.now())
+        if self._overdue:
+            self._overdue = False
+            self._tick()
 
     def _on_next_episode(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._begin(self._episode + 1)
@@ -79,6 +83,9 @@ class RobotWorldNode(TeamNode):
         self._landmarks.publish(convert_robots.landmarks_message(self._bodies.landmarks, self.now(), self._world_frame))
 
     def _tick(self) -> None:
+        if self._is_clock and self._pace.must_wait(self._time, time.monotonic()):
+            self._overdue = True
+            return
         self._time = round(self._time + self._period, 6)
         now = self.now()
         if self.settings['reset_episodes']:
@@ -86,18 +93,23 @@ class RobotWorldNode(TeamNode):
             if episode != self._episode:
                 self._begin(episode)
         self._bodies.move(now, self._period)
-        if self._is_clock:
-            self._clock_out.publish(Clock(clock=convert_robots.time_message(now)))
         for robot, publisher in enumerate(self._odometry):
             publisher.publish(convert_robots.odometry_message(self._bodies.pose(robot, now), float(self._bodies.turns[robot]),
                                                               self._world_frame, self._body_frame(robot)))
         if self._transforms:
             self._transforms.publish(TFMessage(transforms=[self._transform(robot, now) for robot in range(len(self._odometry))]))
-        if not 0.0 <= now - self._shown < MARKERS_PERIOD:
-            self._shown = now
-            bodies = self._bodies
-            self._scene.show(bodies.positions, bodies.headings, bodies.landmarks, bodies.targets)
-            self._markers.publish(markers(self._scene, now, self._world_frame))
+        if self._is_clock:  # last, so that with each moment all is known of it
+            self._clock_out.publish(Clock(clock=convert_robots.time_message(now)))
+
+    def _show(self) -> None:
+        if not self._markers.get_subscription_count():
+            return
+        if not self._watched:
+            self._watched = True
+            listen_for(self, self._scene)
+        bodies = self._bodies
+        self._scene.show(bodies.positions, bodies.headings, bodies.landmarks, bodies.targets)
+        self._markers.publish(markers(self._scene, self.now(), self._world_frame))
 
     def _body_frame(self, robot: int) -> str:
         """Two teams have frames of their own, as they have topics of their own."""

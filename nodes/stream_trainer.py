@@ -53,6 +53,10 @@ class StreamTrainerNode(TrainerNode):
     def on_new_source(self) -> None:
         """Nothing is begun anew: who comes later joins the stream."""
 
+    def _missing(self) -> list[str]:
+        """Whom the graph lacks to begin with. A stream that flowed once flows on: members leave and come back."""
+        return [] if self._answered else super()._missing()
+
     def _ask(self) -> None:
         self._assembler.begin(self._request_rollout().policy_version)
 
@@ -62,7 +66,8 @@ class StreamTrainerNode(TrainerNode):
     def diagnose(self):
         sentence, values = super().diagnose()
         assembler = self._assembler
-        return sentence, {**values, 'episodes with holes': assembler.holed, 'episodes too stale': assembler.stale}
+        return sentence, {**values, 'episodes with holes': assembler.holed, 'episodes somebody left': assembler.left,
+                          'episodes too stale': assembler.stale}
 
 
 def main(args: list[str] | None = None) -> int:

@@ -15,7 +15,7 @@ from visualization_msgs.msg import MarkerArray
 
 from dae_ros.config import BodySettings, BridgeSettings, RunBinding, TaskSettings, declarations
 from dae_ros.robots import standard_messages
-from dae_ros.robots.pilot import LOOKS
+from dae_ros.robots.pilot import LOOKS, without
 from dae_ros.robots.scene import Scene
 from dae_ros.robots.setup import make_watch
 from dae_ros.ros import convert, names, qos
@@ -34,18 +34,18 @@ class TaskMonitorNode(TeamNode):
         self._joint_state = self.publisher(msg.JointState, names.JOINT_STATE, qos.ROLLOUT)
         self._shared_reward = self.publisher(msg.SharedReward, names.SHARED_REWARD, qos.ROLLOUT)
         for robot in range(settings['num_agents']):
-            self.listen(Odometry, names.ODOMETRY.format(robot), qos.SENSOR, partial(self._on_odometry, robot))
+            self.listen(Odometry, names.ODOMETRY.format(robot), qos.WATCHED, partial(self._on_odometry, robot), raw=True)
         self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
-        self.every(1.0 / (LOOKS * settings['control_rate']), self._look)
+        self.as_time_goes_on(1.0 / (LOOKS * settings['control_rate']), self._look, qos.WATCHED)
         self._scene = Scene(settings['num_agents'], self._watch.radius)
         self._markers = self.publisher(MarkerArray, names.MARKERS, qos.NEWEST)
-        listen_for(self, self._scene)
+        self._watched = False  # whether anybody ever was shown the team
         self.every(MARKERS_PERIOD, self._show)
 
-    def _on_odometry(self, robot: int, message: Odometry) -> None:
+    def _on_odometry(self, robot: int, data: bytes) -> None:
         now = self.now()
         if now:
-            self._watch.tracks[robot].take(standard_messages.odometry(message, self._world_frame), now)
+            self._watch.tracks[robot].take(standard_messages.odometry_in(data, self._world_frame)[0], now)
 
     def _on_landmarks(self, message: PoseArray) -> None:
         self._watch.on_landmarks(standard_messages.landmarks(message, self._world_frame))
@@ -60,14 +60,20 @@ class TaskMonitorNode(TeamNode):
     def _show(self) -> None:
         """Shows the team, unless our simulator plays it and does so itself."""
         now = self.now()
+        if not self._markers.get_subscription_count():
+            return
+        if not self._watched:
+            self._watched = True
+            listen_for(self, self._scene)
         if not self._watch.blind_for(now) and self.count_publishers(names.MARKERS) == 1:
-            self._watch.show(self._scene)
+            self._watch.show(self._scene, now)
             self._markers.publish(markers(self._scene, now, self._world_frame))
 
     def diagnose(self):
-        blind = self._watch.blind_for(self.now())
-        self.is_in_trouble = bool(blind)
-        return f'waiting for {blind}' if blind else 'watching', {}
+        now = self.now()
+        blind, lost = self._watch.blind_for(now), self._watch.lost(now)
+        self.is_in_trouble = bool(blind or lost)
+        return f'waiting for {blind}' if blind else f'watching{without(lost)}', {}
 
 
 def main(args: list[str] | None = None) -> int:

@@ -9,6 +9,7 @@ from dae_ros.config import TaskSettings
 from dae_ros.robots.bodies import Bodies
 from dae_ros.robots.geometry import TaskFrame
 from dae_ros.robots.motion import Command, Limits
+from dae_ros.robots.pace import PATIENCE, Pace
 from dae_ros.worlds import make_worlds
 
 LIMITS = Limits(0.5, 2.0, 1.0, 5.0)
@@ -71,3 +72,26 @@ def test_robots_that_meet_push_each_other_and_stay_apart():
         one.obey(0, Command(0.4, 0.0, 0.0), now)
         one.move(now, 0.02)
     assert np.ptp(one.positions[:, 0]) >= 2 * one.radius - 0.01 and one.positions[1, 0] > 0.6
+
+
+def test_a_simulated_clock_waits_at_the_end_of_a_period_for_who_is_driven_and_was_not_told_anything_in_it():
+    one = bodies(robots=2)
+    pace = Pace(one, tick=0.05, control_period=0.1)
+    assert not pace.must_wait(1.05, 0.0)     # nobody is driven yet
+    one.obey(0, Command(0.1, 0.0, 0.0), now=1.0)
+    assert not pace.must_wait(1.05, 0.0)     # told in this period
+    assert not pace.must_wait(1.10, 0.0)     # the next one goes on for another tick
+    assert pace.must_wait(1.15, 0.0) and pace.must_wait(1.15, 0.9 * PATIENCE)
+    one.obey(0, Command(0.1, 0.0, 0.0), now=1.15)
+    assert not pace.must_wait(1.15, 0.95 * PATIENCE)
+    assert pace.must_wait(1.25, 3.0) and not pace.must_wait(1.25, 3.0 + PATIENCE)  # whom nobody drives any more
+    assert not pace.must_wait(1.85, 4.0)
+
+
+def test_a_clock_that_ticks_once_a_period_waits_each_time_and_a_new_episode_changes_nothing_about_it():
+    one = bodies(robots=1)
+    pace = Pace(one, tick=0.1, control_period=0.1)
+    one.obey(0, Command(0.1, 0.0, 0.0), now=2.4)
+    assert not pace.must_wait(2.4, 0.0) and pace.must_wait(2.5, 0.0)
+    one.place(1)
+    assert pace.must_wait(2.5, 0.01)

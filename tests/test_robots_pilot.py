@@ -32,8 +32,8 @@ def answer(observation, action=EAST):
 class Team:
     """Robot 0 of two, its pilot, and a clock."""
 
-    def __init__(self, landmarks=LANDMARKS, enabled=True):
-        self.safety = Safety(0, 2, BOUNDS, enabled)
+    def __init__(self, landmarks=LANDMARKS, enabled=True, go_on=False):
+        self.safety = Safety(0, 2, BOUNDS, enabled, go_on)
         self.pilot = Pilot(0, 1, TaskMonitor(TaskSettings(num_agents=2)),
                            Motion(False, Limits(2.0, 5.0, 1.0, 1.0), TaskFrame()), TaskFrame(), PERIOD, self.safety)
         self.now = 100.0
@@ -226,3 +226,33 @@ def test_an_answer_counts_once_and_not_after_a_stop():
     team.pilot.look(team.now + 0.01)
     with pytest.raises(Refused):
         team.pilot.on_action(answer(turn.observation))
+
+
+def test_where_it_goes_on_without_lost_team_mates_it_has_met_all_of_them_once():
+    team = Team(go_on=True)
+    for _ in range(3):
+        team.step(0)
+    assert team.pilot.stop.reason == 'teammate' and 'has not come yet' in team.pilot.stop.detail
+    team.step(0, 1)
+    for _ in range(30):
+        turn, command = team.step(0)
+        assert command is not None and turn.observation.values[0, 8] == 1.0
+    assert team.pilot.lost(team.now) == [1] and team.pilot.lost(team.now - 2.5) == []
+    team.step(1)
+    assert team.step(1)[0] == (STOP, None)  # its own odometry it cannot do without
+
+
+def test_a_late_answer_counts_within_the_timeout_and_not_once_a_later_one_came():
+    team = Team()
+    first, second, third, fourth = (team.step(0, 1, answers=False)[0].observation for _ in range(4))
+    assert [one.episode_start[0] for one in (first, second, third)] == [True, False, False]
+    for late in (answer(first), answer(second)._replace(robot=1)):  # 0.3 s old
+        with pytest.raises(Refused):
+            team.pilot.on_action(late)
+    assert team.pilot.stop.reason == 'agent'
+    assert team.pilot.on_action(answer(third)).forward > 0.0
+    with pytest.raises(Refused):
+        team.pilot.on_action(answer(second))
+    team.pilot.on_action(answer(fourth))
+    turn, _ = team.step(0, 1)
+    assert team.pilot.stop is None and not turn.observation.episode_start[0]

@@ -32,13 +32,13 @@ def policy():
 class Team:
     """Two simulated robots with their bridges and agents, who watches them, and the trainer's end, without ROS."""
 
-    def __init__(self, max_staleness=1):
+    def __init__(self, max_staleness=1, go_on=False):
         spec = TaskMonitor(TASK).spec
         self.bodies = Bodies(TASK, TaskFrame(), LIMITS, False, seed=1)
         self.pilots = [Pilot(robot, RUN, TaskMonitor(TASK), Motion(False, LIMITS, TaskFrame()), TaskFrame(), PERIOD,
-                             Safety(robot, 2, BOUNDS, enabled=True)) for robot in range(2)]
+                             Safety(robot, 2, BOUNDS, enabled=True, go_on=go_on)) for robot in range(2)]
         self.agents = [ActingEnd(robot, False, 1, RUN) for robot in range(2)]
-        self.watch = Watch(RUN, TaskMonitor(TASK), TaskFrame(), PERIOD, BOUNDS)
+        self.watch = Watch(RUN, TaskMonitor(TASK), TaskFrame(), PERIOD, BOUNDS, go_on)
         self.assembler = StreamAssembler(spec, EPISODES, STEPS, RUN, max_staleness)
         self.assembler.begin(0)
         for agent in self.agents:
@@ -47,11 +47,11 @@ class Team:
             one.on_landmarks(self.bodies.landmarks)
         self.now, self.log = 100.1, []  # in the middle of an episode
 
-    def tick(self, lost=lambda datum: False):
-        """Half a control period; data for which `lost` holds never arrive."""
+    def tick(self, lost=lambda datum: False, silent=()):
+        """Half a control period; data for which `lost` holds never arrive, and no odometry of robots that are `silent`."""
         self.now = round(self.now + PERIOD / 2, 6)
         self.bodies.move(self.now, PERIOD / 2)
-        for robot in range(2):
+        for robot in {0, 1}.difference(silent):
             pose = self.bodies.pose(robot, self.now)
             for track in (self.watch.tracks[robot], *(pilot._safety.tracks[robot] for pilot in self.pilots)):
                 track.take(pose, self.now)

@@ -25,6 +25,7 @@ class Bodies:
         self.episode_steps = worlds.episode_steps
         self.radius = worlds.radius * frame.scale
         self._first, self._second = np.triu_indices(self.num_robots, k=1)
+        self._heard = [-math.inf] * self.num_robots
         self.place(0)
 
     def place(self, episode: int) -> None:
@@ -36,7 +37,6 @@ class Bodies:
         self.velocities = np.zeros((self.num_robots, 2))  # world frame
         self.turns = np.zeros(self.num_robots)            # rad/s
         self._commands = [STOP] * self.num_robots
-        self._heard = [-math.inf] * self.num_robots
 
     @property
     def targets(self) -> np.ndarray:
@@ -52,6 +52,10 @@ class Bodies:
         share = min(1.0, limits.speed / speed) if speed else 1.0
         turn = max(-limits.turn_rate, min(limits.turn_rate, command.turn))
         self._commands[robot], self._heard[robot] = Command(share * command.forward, share * left, turn), now
+
+    def untold(self, since: float) -> bool:
+        """Whether a robot that is being driven has been told nothing since then."""
+        return any(since - COMMAND_TIMEOUT <= heard < since - 1e-6 for heard in self._heard)
 
     def move(self, now: float, duration: float) -> None:
         """Moves everybody for `duration` as told; whoever was told nothing for long stands."""

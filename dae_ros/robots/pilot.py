@@ -35,6 +35,11 @@ def stamp_at(now: float, period: float, episode_steps: int, run: int) -> Stamp:
     return Stamp(run, episode % LARGEST_ROLLOUT, 0, step)
 
 
+def without(robots: list[int]) -> str:
+    """Who is missed, for people: the end of a sentence."""
+    return f' without robot {", ".join(map(str, robots))}' if robots else ''
+
+
 class Pilot:
     """Drives one robot as its agent says, or lets it stand and knows why."""
 
@@ -45,12 +50,16 @@ class Pilot:
         self._period, self._safety = period, safety
         self._landmarks: np.ndarray | None = None
         self._seen: Stamp | None = None   # of the last observation
-        self._asked: Stamp | None = None  # of the observation that waits for its action
+        self._asked: dict[Stamp, float] = {}  # when the observations that wait for their action were made; s
         self._moving = False              # whether the episode goes on
 
     @property
     def enabled(self) -> bool:
         return self._safety.enabled
+
+    def lost(self, now: float) -> list[int]:
+        """Team mates that are heard of no more."""
+        return self._safety.lost(now)
 
     def enable(self, enabled: bool) -> None:
         """Lets the robot move, or not."""
@@ -84,28 +93,33 @@ class Pilot:
         self._moving = False
         if reason == Stop.AGENT:  # it may come back
             return Turn(command, self._observe(step, now)) if is_new else Turn(command if is_told else None)
-        self._seen, self._asked = step, None
+        self._seen = step
+        self._asked.clear()
         # A robot that is not enabled may be driven by somebody else: it is told to stand once.
         return Turn(command if is_told or (is_new and reason != Stop.DISABLED) else None)
 
     def on_action(self, action: Action) -> Command:
-        """The command for the agent's answer. Raises Refused if it does not answer the last observation."""
+        """The command for the agent's answer. Raises Refused if it answers no observation, or one before what is answered."""
         if action.robot != self._robot:
             raise Refused(Refused.WRONG_ROBOT, f'action of robot {action.robot}, this is robot {self._robot}')
-        if self._asked is None or action.stamp != self._asked:
-            raise Refused(Refused.STALE, f'an answer to {action.stamp}, the last observation was {self._asked}')
+        if action.stamp not in self._asked:
+            raise Refused(Refused.STALE, f'an answer to {action.stamp}, the last observation was {self._seen}')
         spec = self._monitor.spec
         check_action(action, spec.num_agents, 1, spec.num_actions, action.policy_version)
-        self._asked, self._moving = None, True
-        self._safety.answered()
+        asked = list(self._asked)
+        for stamp in asked[:asked.index(action.stamp) + 1]:
+            del self._asked[stamp]
+        self._safety.answered(next(iter(self._asked.values()), None))
         return self._motion.act(int(action.actions[0]), self._safety.tracks[self._robot].pose.heading)
 
     def _observe(self, step: Stamp, now: float) -> Observation:
-        poses = [track.pose for track in self._safety.tracks]
-        sight = self._monitor.see(self._frame.positions([pose.position for pose in poses]),
-                                  self._frame.velocities([pose.velocity for pose in poses]),
-                                  self._frame.positions(self._landmarks))
+        poses = [track.held(now) for track in self._safety.tracks]
+        observations, _ = self._monitor.observe(self._frame.positions([pose.position for pose in poses]),
+                                                self._frame.velocities([pose.velocity for pose in poses]),
+                                                self._frame.positions(self._landmarks))
         start = not self._moving or step.rollout != self._seen.rollout
-        self._seen = self._asked = step
+        self._seen, self._moving = step, True
+        self._asked = {stamp: asked for stamp, asked in self._asked.items() if self._safety.waits(asked, now)}
+        self._asked[step] = now
         self._safety.asked(now)
-        return Observation(step, self._robot, 0, np.array([start]), sight.observations[self._robot:self._robot + 1])
+        return Observation(step, self._robot, 0, np.array([start]), observations[self._robot:self._robot + 1])

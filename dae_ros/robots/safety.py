@@ -59,6 +59,10 @@ class Track:
                 raise Refused(Refused.JUMP, f'{distance:.2f} m in {elapsed:.3f} s')
         self.pose = pose
 
+    def held(self, now: float) -> Pose:
+        """The last good odometry; a robot that is not heard of any more counts as standing where it was."""
+        return self.pose if self.age(now) <= self._bounds.odometry_timeout else self.pose._replace(velocity=(0.0, 0.0))
+
     def age(self, now: float) -> float:
         """How old the last good odometry is [s]; infinite before the first."""
         return math.inf if self.pose is None else now - self.pose.time
@@ -67,12 +71,14 @@ class Track:
 class Safety:
     """What lets one robot of a team move."""
 
-    def __init__(self, robot: int, num_agents: int, bounds: Bounds, enabled: bool = False):
+    def __init__(self, robot: int, num_agents: int, bounds: Bounds, enabled: bool = False, go_on: bool = False):
+        """`go_on`: without team mates that were there once and are heard of no more."""
         self.enabled = enabled
         self.has_landmarks = False
         self.tracks = [Track(bounds) for _ in range(num_agents)]
         self._robot = robot
         self._bounds = bounds
+        self._go_on = go_on
         self._unanswered_since: float | None = None
 
     def asked(self, now: float) -> None:
@@ -80,9 +86,13 @@ class Safety:
         if self._unanswered_since is None:
             self._unanswered_since = now
 
-    def answered(self) -> None:
-        """The agent acted on the last observation."""
-        self._unanswered_since = None
+    def answered(self, since: float | None) -> None:
+        """The agent acted; the first observation that it has not acted on yet is of `since` [s], None if there is none."""
+        self._unanswered_since = since
+
+    def waits(self, asked: float, now: float) -> bool:
+        """Whether the agent may still answer at `now` what it was asked then."""
+        return 0.0 <= now - asked <= self._bounds.action_timeout
 
     def stop(self, now: float) -> Stop | None:
         """Why the robot must stand now; None if it may move. Whoever stands for another reason owes no answer."""
@@ -102,11 +112,16 @@ class Safety:
             return Stop(Stop.OWN_ODOMETRY, f'its own odometry {_old(age, self._bounds.odometry_timeout)}')
         if not self.has_landmarks:
             return Stop(Stop.LANDMARKS, 'where the landmarks are is not known yet')
-        for robot, track in enumerate(self.tracks):
-            age = track.age(now)
-            if age > self._bounds.teammate_hold and robot != self._robot:
+        for robot in self.lost(now):
+            if not self._go_on or self.tracks[robot].pose is None:
+                age = self.tracks[robot].age(now)
                 return Stop(Stop.TEAMMATE, f'the odometry of robot {robot} {_old(age, self._bounds.teammate_hold)}')
         return None
+
+    def lost(self, now: float) -> list[int]:
+        """Team mates that have not been heard of for longer than they are held."""
+        return [robot for robot, track in enumerate(self.tracks)
+                if robot != self._robot and track.age(now) > self._bounds.teammate_hold]
 
 
 def _old(age: float, bound: float) -> str:

@@ -44,14 +44,18 @@ def make_pilot(settings: Mapping[str, Any]) -> Pilot:
     motion = Motion(settings['drive'] == 'differential', limits_in(settings), frame)
     bounds = Bounds(*(settings[name] for name in Bounds._fields))
     return Pilot(robot, settings['run'] or RUN, monitor, motion, frame,
-                 1.0 / settings['control_rate'], Safety(robot, num_agents, bounds, settings['enabled']))
+                 1.0 / settings['control_rate'], Safety(robot, num_agents, bounds, settings['enabled'], _goes_on(settings)))
 
 
 def make_watch(settings: Mapping[str, Any]) -> Watch:
     """Who watches the whole team. Raises SettingsError."""
     bounds = Bounds(*(settings[name] for name in Bounds._fields))
     return Watch(settings['run'] or RUN, TaskMonitor(task_settings(settings)), task_frame(settings),
-                 1.0 / settings['control_rate'], bounds)
+                 1.0 / settings['control_rate'], bounds, _goes_on(settings))
+
+
+def _goes_on(settings: Mapping[str, Any]) -> bool:
+    return settings['on_lost_team_mate'] == 'go_on'
 
 
 def landmarks_in(text: str) -> np.ndarray:

@@ -70,10 +70,15 @@ class TaskMonitor:
 
         All in task units (`geometry.TaskFrame`). ValueError if an argument is of another shape.
         """
+        observations, state = self.observe(positions, velocities, landmarks)
+        return Sight(observations, state, float(self._worlds.reward()[0]))
+
+    def observe(self, positions: np.ndarray, velocities: np.ndarray, landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same without the reward: observations [N, O] and state [S], float32."""
         given = np.shape(positions), np.shape(velocities), np.shape(landmarks)
         needed = *2 * [(self.spec.num_agents, 2)], (self.num_landmarks, 2)
         if given != needed:
             raise ValueError(f'positions, velocities and landmarks are {given} where {needed} is needed')
         self._worlds.set_state(positions, velocities, landmarks)
         observations, state = self._worlds.observe()
-        return Sight(observations[0], state[0], float(self._worlds.reward()[0]))
+        return observations[0], state[0]

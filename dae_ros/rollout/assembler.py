@@ -36,25 +36,25 @@ class Assembler:
         self._final_states: dict[int, np.ndarray] = {}
         self._have_state = np.zeros(T + 1, bool)
         self._have_action = np.zeros((T, N), bool)
-        self._asked = np.ones((T, N), bool)  # whose action a step needs
+        self.asked = np.ones((T, N), bool)  # whose action a step needs
 
     @property
     def complete(self) -> bool:
         """Whether nothing of the rollout is missing."""
-        return (self.request is not None and bool(self._have_state.all()) and not self._lacks_actions.any()
+        return (self.request is not None and bool(self._have_state.all()) and not self.lacks_actions.any()
                 and len(self._final_states) == self.request.num_steps)
 
     @property
-    def _lacks_actions(self) -> np.ndarray:
+    def lacks_actions(self) -> np.ndarray:
         """Whose actions are missing, [T, N] bool: not those of robots that had left everywhere."""
-        return self._asked & ~self._have_action
+        return self.asked & ~self._have_action
 
     def missing(self) -> str:
         """What has not arrived, for people."""
         if self.request is None:
             return 'nothing was requested'
         T = self.request.num_steps
-        silent = [str(robot) for robot in np.flatnonzero(self._lacks_actions.any(axis=0))]
+        silent = [str(robot) for robot in np.flatnonzero(self.lacks_actions.any(axis=0))]
         return (f'{T + 1 - self._have_state.sum()} of {T + 1} joint states, {T - len(self._final_states)} of {T} rewards, '
                 f'actions of {"robots " + ", ".join(silent) if silent else "no robot"}')
 
@@ -83,7 +83,14 @@ class Assembler:
         if joint.present is not None:
             self._present = np.ones((T, W, N), bool) if self._present is None else self._present
             self._present[step] = joint.present
-            self._asked[step] = joint.present.any(axis=0)
+            self.asked[step] = joint.present.any(axis=0)
+
+    def leave(self, robot: int, step: int) -> None:
+        """The robot counts as having left its team in all worlds from this step on, whatever came of it."""
+        if self._present is None:
+            self._present = np.ones((self.request.num_steps, self._num_worlds, self._spec.num_agents), bool)
+        self._present[step:, :, robot] = False
+        self.asked[step:, robot] = False
 
     def on_action(self, action: Action) -> None:
         """Takes in one robot's action of one step."""
@@ -119,7 +126,7 @@ class Assembler:
         assert self.complete, self.missing()
         finals = np.concatenate([self._final_states[step] for step in range(self.request.num_steps)])
         nothing = np.eye(1, self._spec.num_actions, dtype=np.float32)[0]
-        for step, robot in np.argwhere(~self._have_action):
+        for step, robot in np.argwhere(~self.asked | ~self._have_action):
             self._actions[step, :, robot], self._probabilities[step, :, robot] = 0, nothing
         return Trajectory(self._observations, self._states, self._episode_start, self._actions, self._probabilities,
                           self._rewards, self._terminated, self._truncated, finals, self._available, self._present, self._won)

@@ -2,12 +2,12 @@
 
 Episodes are joined on the stamps, which the clock gave. One that is whole counts; so many of them side by side make a
 trajectory. One with a hole is dropped, for its recurrent states and its returns cannot be told, and so is one that was acted
-with too old a policy.
+with too old a policy. Who falls silent for the rest of an episode, or begins anew in its middle, has left the team until its end.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import numpy as np
 
 from dae_ros.errors import Refused
 from dae_ros.rollout.assembler import Assembler
@@ -18,13 +18,51 @@ from dae_ros.types import Action, JointState, Observation, RolloutRequest, Share
 OPEN_EPISODES = 3  # an older one that is not whole will never be
 
 
-class _Episode(NamedTuple):
-    """One episode on its way: a rollout of one world."""
+class _Episode:
+    """One episode on its way: a rollout of one world, of which each robot says itself what it saw."""
 
-    assembler: Assembler
-    joint_states: dict[int, JointState]                # by step, those whose observations are not all there
-    observations: dict[tuple[int, int], Observation]   # by step and robot
-    versions: set[int]                                 # of the policies that acted
+    def __init__(self, spec: WorldSpec, request: RolloutRequest):
+        self.assembler = Assembler(spec, 1)
+        self.assembler.begin(request)
+        self.versions: set[int] = set()  # of the policies that acted
+        T, N = request.num_steps, spec.num_agents
+        self._values = np.zeros((T, N, spec.observation_size), np.float32)
+        self._seen = np.zeros((T, N), bool)
+        self._begun = np.zeros((T, N), bool)  # who remembered nothing at a step
+
+    def on_observation(self, observation: Observation) -> None:
+        """Takes in what a robot of the team saw at a step of the episode."""
+        step, robot = observation.stamp.step, observation.robot
+        self._values[step, robot] = observation.values[0]
+        self._seen[step, robot], self._begun[step, robot] = True, observation.episode_start[0]
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is missing."""
+        return self.assembler.complete and not self._lacks.any()
+
+    @property
+    def _lacks(self) -> np.ndarray:
+        """Of whom something is missing, [T, N] bool."""
+        return self.assembler.lacks_actions | (self.assembler.asked & ~self._seen)
+
+    def settle(self) -> None:
+        """Has robots leave where they fell silent to the end, or began anew in the middle. Any other gap stays a hole."""
+        lacks, in_the_middle = self._lacks, np.arange(len(self._seen)) > 0
+        broken = lacks | (self.assembler.asked & self._begun & in_the_middle[:, None])
+        for robot in np.flatnonzero(broken.any(axis=0)):
+            first = int(np.argmax(broken[:, robot]))
+            back = np.flatnonzero(self._seen[first + 1:, robot])
+            if not lacks[first, robot] or not back.size or self._begun[first + 1 + back[0], robot]:
+                self.assembler.leave(int(robot), first)
+
+    def trajectory(self) -> Trajectory | None:
+        """The episode, if nothing is missing and somebody was always there."""
+        if not self.complete or not self.assembler.asked.any(axis=1).all():
+            return None
+        trajectory = self.assembler.trajectory()
+        np.copyto(trajectory.observations, self._values[:, None], where=self._seen[:, None, :, None])
+        return trajectory
 
 
 class StreamAssembler:
@@ -36,6 +74,7 @@ class StreamAssembler:
     def __init__(self, spec: WorldSpec, num_episodes: int, num_steps: int, run: int, max_staleness: int):
         self.holed = 0  # episodes dropped for a hole
         self.stale = 0  # whole episodes dropped for too old a policy
+        self.left = 0   # whole episodes which somebody left
         self._spec, self._num_episodes, self._num_steps = spec, num_episodes, num_steps
         self._run, self._max_staleness = run, max_staleness
         self._open: dict[int, _Episode] = {}
@@ -54,7 +93,7 @@ class StreamAssembler:
     def trajectory(self) -> Trajectory:
         """The oldest whole episodes side by side, [num_steps, num_episodes, ...]; they are taken out."""
         taken, self._whole = self._whole[:self._num_episodes], self._whole[self._num_episodes:]
-        return join([trajectory for _, trajectory in taken])
+        return join(_with_members([trajectory for _, trajectory in taken]))
 
     def begin(self, policy_version: int) -> None:
         """From here on the newest policy has this version; what lies waiting and is too stale by now is dropped."""
@@ -79,18 +118,16 @@ class StreamAssembler:
             raise Refused(Refused.WRONG_ROBOT, f'robot {observation.robot} of a team of {self._spec.num_agents}')
         if observation.values.shape != (1, size):
             raise Refused(Refused.WRONG_SHAPE, f'observations {observation.values.shape}, expected {(1, size)}')
-        episode = self._episode(stamp)
-        episode.observations[stamp.step, observation.robot] = observation
-        self._take_joint_state(episode, stamp)
+        if stamp.step >= self._num_steps:
+            raise Refused(Refused.OUT_OF_RANGE, f'step {stamp.step} of an episode of {self._num_steps}')
+        if not np.isfinite(observation.values).all():
+            raise Refused(Refused.NOT_FINITE, 'an observation is not finite')
+        self._episode(stamp).on_observation(observation)
+        self._close_if_whole(stamp.rollout)
 
     def on_joint_state(self, joint: JointState) -> None:
         """Takes in the state of a step; step `num_steps` is what the episode ended with."""
-        episode = self._episode(joint.stamp)
-        if joint.stamp.step == self._num_steps:
-            episode.assembler.on_joint_state(joint)
-        else:
-            episode.joint_states[joint.stamp.step] = joint
-            self._take_joint_state(episode, joint.stamp)
+        self._episode(joint.stamp).assembler.on_joint_state(joint)
         self._close_if_whole(joint.stamp.rollout)
 
     def on_reward(self, shared: SharedReward) -> None:
@@ -104,39 +141,36 @@ class StreamAssembler:
         if self._closed is not None and rollout <= self._closed:
             raise Refused(Refused.STALE, f'episode {rollout} is closed')
         if rollout not in self._open:
-            assembler = Assembler(self._spec, 1)
-            assembler.begin(RolloutRequest(self._run, rollout, stamp.attempt, 0, 0, self._num_steps, False))
-            self._open[rollout] = _Episode(assembler, {}, {}, set())
+            request = RolloutRequest(self._run, rollout, stamp.attempt, 0, 0, self._num_steps, False)
+            self._open[rollout] = _Episode(self._spec, request)
             while len(self._open) > OPEN_EPISODES:
                 self._close(min(self._open))
-                self.holed += 1
             if rollout not in self._open:
                 raise Refused(Refused.STALE, f'episode {rollout} is older than those under way')
         return self._open[rollout]
 
-    def _take_joint_state(self, episode: _Episode, stamp: Stamp) -> None:
-        """Joins the state of a step with what each robot saw, once all of it is there."""
-        joint, robots = episode.joint_states.get(stamp.step), range(self._spec.num_agents)
-        if joint is None or any((stamp.step, robot) not in episode.observations for robot in robots):
-            return
-        del episode.joint_states[stamp.step]
-        seen = joint.observations.copy()
-        for robot in robots:
-            seen[0, robot] = episode.observations[stamp.step, robot].values[0]
-        episode.assembler.on_joint_state(joint._replace(observations=seen))
-        self._close_if_whole(stamp.rollout)
-
     def _close_if_whole(self, rollout: int) -> None:
         episode = self._open.get(rollout)
-        if episode is not None and episode.assembler.complete:
-            self._whole.append((min(episode.versions), episode.assembler.trajectory()))
+        if episode is not None and episode.complete:
             self._close(rollout)
 
     def _close(self, rollout: int) -> None:
-        del self._open[rollout]
-        for older in [other for other in self._open if other < rollout]:
-            del self._open[older]
-            self.holed += 1
+        """Takes what is whole of the episodes up to this one; nothing more of them is waited for."""
+        for older in sorted(other for other in self._open if other <= rollout):
+            episode = self._open.pop(older)
+            episode.settle()
+            trajectory = episode.trajectory()
+            if trajectory is None:
+                self.holed += 1
+                continue
+            self.left += trajectory.present is not None
+            self._whole.append((min(episode.versions), trajectory))
         self._closed = rollout
 
 
+def _with_members(episodes: list[Trajectory]) -> list[Trajectory]:
+    """The same; where somebody left one of them, all say who was present."""
+    if all(episode.present is None for episode in episodes):
+        return episodes
+    return [episode if episode.present is not None else episode._replace(present=np.ones(episode.actions.shape, bool))
+            for episode in episodes]

@@ -10,7 +10,8 @@ import yaml
 from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
 from dae_ros.errors import SettingsError
 from dae_ros.robots.setup import task_settings
-from dae_ros.ros.graph import NodeProcess, key_parameters, shipped_config, training_graph
+from dae_ros.ros import names
+from dae_ros.ros.graph import NodeProcess, key_parameters, process_groups, shipped_config, training_graph
 from dae_ros.run_folder import RunFolder
 
 NEEDED = {'seed', *(name for name, info in SETTINGS.items() if info.group == 'task'), *ROBOT_SETTINGS}
@@ -28,14 +29,25 @@ def find_policy(name: str) -> str:
 
 
 def execution_graph(values: dict[str, Any], policy_file: str, simulate: bool, key_file: str = '') -> list[NodeProcess]:
-    """An agent and a bridge for each robot; with `simulate` also the robots, which may then move from the start."""
+    """An agent and a bridge for each robot; with `simulate` also the robots, which may then move from the start, and as many of
+    their agents and bridges in one process as `robots_per_process` says: there is no robot whose nodes must stand alone."""
     robots = range(task_settings(values).num_agents)
     own_clock = clock_parameters(values, simulate)
     agent = {'execute': True, **({'policy_file': policy_file} if policy_file else key_parameters(key_file)), **own_clock}
     bridge = {'enabled': values.get('enabled', simulate), **own_clock}
-    return [*([NodeProcess('world', 'world', {'real_time_factor': real_time_factor(values)})] if simulate else []),
-            *(NodeProcess('agent', f'agent_{robot}', {'robot': robot, **agent}) for robot in robots),
+    if simulate:
+        world = NodeProcess('world', 'world', {'real_time_factor': real_time_factor(values)})
+        groups = process_groups(robots, values.get('robots_per_process', 0))
+        return [world, *(_robots(group, {**agent, **bridge}) for group in groups)]
+    return [*(NodeProcess('agent', f'agent_{robot}', {'robot': robot, **agent}) for robot in robots),
             *(NodeProcess('robot_bridge', f'bridge_{robot}', {'robot': robot, **bridge}) for robot in robots)]
+
+
+def _robots(robots: range, parameters: dict[str, Any]) -> NodeProcess:
+    """Some robots of ours, all in one process."""
+    nodes = tuple(name for robot in robots for name in (names.agent_node(robot, 0, 1), names.BRIDGE_NODE.format(robot)))
+    parameters = {'robot': robots[0], 'robots': len(robots), **parameters}
+    return NodeProcess('robot', f'robots_{robots[0]}-{robots[-1]}', parameters, nodes)
 
 
 def streaming_graph(settings: Settings, values: dict[str, Any], folder: RunFolder, simulate: bool,
@@ -44,7 +56,7 @@ def streaming_graph(settings: Settings, values: dict[str, Any], folder: RunFolde
     server, trainer = training_graph(settings, folder, key_file)[-2:]
     monitor = NodeProcess('task_monitor', 'task_monitor', clock_parameters(values, simulate))
     more = {'world': {}, 'agent': {'run': folder.run, 'greedy': False}, 'robot_bridge': {'run': folder.run},
-            'task_monitor': {'run': folder.run}}
+            'robot': {'run': folder.run, 'greedy': False}, 'task_monitor': {'run': folder.run}}
     robots = {name: value for name, value in values.items() if name in ROBOT_SETTINGS}  # not in the run's settings file
     return [server, trainer._replace(executable='stream_trainer', parameters={**trainer.parameters, **robots}),
             *(process._replace(parameters={**robots, **process.parameters, **more[process.executable]})

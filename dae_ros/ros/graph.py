@@ -72,11 +72,16 @@ def _group(settings: Settings, group: int, run: dict[str, int], key: dict[str, s
     """World and agents of one group, numbered where there are several."""
     task = settings.task
     mark = f'_{group}' if task.world_groups > 1 else ''
-    # With SROS 2 a process has one enclave, and every robot's names its own topics alone.
-    together = 1 if _secured() else settings.run.robots_per_process or task.num_agents
-    teams = [range(first, min(first + together, task.num_agents)) for first in range(0, task.num_agents, together)]
+    teams = process_groups(range(task.num_agents), settings.run.robots_per_process)
     return [NodeProcess('world', f'world{mark}', {'group': group, **run}),
             *(_agents(robots, group, task.world_groups, mark, {**run, **key}) for robots in teams)]
+
+
+def process_groups(robots: range, together: int) -> list[range]:
+    """The robots, so many `together` whose nodes share a process; 0 for all."""
+    # With SROS 2 a process has one enclave, and every robot's names its own topics alone.
+    together = 1 if _secured() else together or len(robots)
+    return [robots[first:first + together] for first in range(0, len(robots), together)]
 
 
 def _agents(robots: range, group: int, world_groups: int, mark: str, given: dict[str, int | str]) -> NodeProcess:

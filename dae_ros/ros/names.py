@@ -26,6 +26,7 @@ NEXT_EPISODE = '~/next_episode'
 ACTIVATE_POLICY = '~/activate_policy'
 ENABLE = '~/enable'
 DIAGNOSTICS = '/diagnostics'
+BRIDGE_NODE = 'bridge_{}'
 
 
 def in_group(topic: str, group: int, world_groups: int) -> str:

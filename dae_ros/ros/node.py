@@ -23,10 +23,12 @@ from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock as ClockMessage
 
 from dae_ros.command import refuse
 from dae_ros.config import SettingInfo
 from dae_ros.errors import DaeRosError, Refused
+from dae_ros.robots.standard_messages import seconds
 from dae_ros.ros import names, params, qos, shared_memory
 from dae_ros.ros.clock_watch import ClockWatch
 
@@ -74,6 +76,7 @@ class TeamNode(Node):
         self.busy = False  # whether a callback is at work
         self.is_in_trouble = False  # whether diagnostics warn; `diagnose` may set it
         self.failure: BaseException | None = None  # what a callback raised; ends the node
+        self._moment: float | None = None  # of simulated time, where each counts
         self._refusals: Counter[tuple[str, str]] = Counter()
         self._diagnostics = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.EVENTS)
         self.every(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
@@ -104,6 +107,25 @@ class TeamNode(Node):
         """A timer that calls `act` each `period` seconds, whatever becomes of the host's clock or of simulated time."""
         return self.create_timer(period, self._guarded(act), clock=STEADY)
 
+    def as_time_goes_on(self, period: float, act: Callable[[], None], profile: QoSProfile) -> None:
+        """Calls `act` each `period` seconds, or where time is simulated with each message of its clock, once there are any.
+
+        So no moment is passed over, however much faster than ours it runs. `now` is then the one at hand; `profile` says whether
+        each counts or the newest.
+        """
+        def on_clock(message: ClockMessage) -> None:
+            self._moment = seconds(message.clock)
+            act()
+
+        def on_timer() -> None:
+            if not self._moment:
+                act()
+
+        self.every(period, on_timer)
+        if self.get_parameter('use_sim_time').value:
+            self._moment = 0.0
+            self.listen(ClockMessage, names.CLOCK, profile, on_clock)
+
     def create_service(self, srv_type: type, srv_name: str, callback: Callable, **options) -> Service:
         """A service. Those with which rclpy lets anyone change parameters refuse: it would fall over a value of an unknown type,
         and with simulated time switched on the node's clock stands still."""
@@ -124,7 +146,7 @@ class TeamNode(Node):
 
     def now(self) -> float:
         """The time of this node's clock [s]; 0 before simulated time has begun."""
-        return self.get_clock().now().nanoseconds / 1e9
+        return self.get_clock().now().nanoseconds / 1e9 if self._moment is None else self._moment
 
     def refuse(self, topic: str, refusal: Refused) -> None:
         """Counts a refused message; the first one for each topic and reason is also logged."""

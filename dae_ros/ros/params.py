@@ -7,8 +7,9 @@ from typing import Any, Iterable, Mapping
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from dae_ros.config import ROBOT_SETTINGS, SETTINGS, SettingInfo, unknown_setting
+from dae_ros.config import ROBOT_SETTINGS, SETTINGS, SettingInfo, TeamKey, declarations, unknown_setting
 
+KEY = {info.name: info for info in declarations(TeamKey)}
 BUILT_IN = ('use_sim_time', 'start_type_description_service')
 
 
@@ -20,7 +21,7 @@ def declare(node: Node, declared: Iterable[SettingInfo]) -> dict[str, Any]:
     setting of another node's is fine, since one task file serves all nodes. Raises SettingsError.
     """
     declared = {info.name: info for info in declared}
-    known = {**SETTINGS, **ROBOT_SETTINGS, **declared}
+    known = {**SETTINGS, **ROBOT_SETTINGS, **KEY, **declared}
     overrides = _take_overrides(node)
     for name in overrides:
         if name not in known:

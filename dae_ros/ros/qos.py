@@ -28,6 +28,14 @@ SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5, reliability=Reliab
                     durability=DurabilityPolicy.VOLATILE)
 """Odometry: only the newest counts, and whoever publishes it may be reliable or not."""
 
+NOW = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT,
+                 durability=DurabilityPolicy.VOLATILE)
+"""Odometry and simulated time, for who acts: of what came while it was busy only the newest counts."""
+
+WATCHED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.BEST_EFFORT,
+                     durability=DurabilityPolicy.VOLATILE)
+"""Simulated time and odometry, for who watches: each moment counts, also those it was too busy for."""
+
 NEWEST = _reliable(1, DurabilityPolicy.VOLATILE)
 """For publishers of what soon has a successor, such as velocity commands: others may listen reliably or not."""
 

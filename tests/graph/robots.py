@@ -9,7 +9,7 @@ import time
 from collections import defaultdict
 from functools import partial
 from pathlib import Path
-from typing import Callable
+from typing import Callable, Iterable
 
 import numpy as np
 from dae_ros_msgs import msg
@@ -26,6 +26,7 @@ from dae_ros.ros.supervisor import Supervisor
 POLICY = REPOSITORY / 'config' / 'policies' / 'navigation.safetensors'
 BEGINNING = 1000.0  # s
 PERIOD = 0.1        # s
+PATIENCE = 2.0      # s of ours
 FRAME = 'map'
 LANDMARKS = np.array([[0.5, 0.5], [-0.5, 0.0], [0.2, -0.6]])
 PLACES = np.array([[0.0, 0.0], [0.9, -0.2], [-0.3, 0.8]])
@@ -63,12 +64,13 @@ class Processes:
 
 
 class Stage(Listener):
-    """The clock, three robots that stand where they are put, and everything that is said to and about them."""
+    """The clock, robots that stand where they are put, and everything that is said to and about them."""
 
-    def __init__(self, command: type = Twist):
+    def __init__(self, command: type = Twist, places: np.ndarray = PLACES):
         super().__init__()
         self.now = BEGINNING
-        self.places = PLACES.copy()
+        self.places = places.copy()
+        self.robots = range(len(places))
         self.commands: dict[int, list] = defaultdict(list)
         self.observations: dict[int, list] = defaultdict(list)
         self.actions: dict[int, list] = defaultdict(list)
@@ -76,8 +78,8 @@ class Stage(Listener):
         node = self.node
         self.clock = node.create_publisher(Clock, '/clock', 10)
         self.landmarks = node.create_publisher(PoseArray, names.LANDMARKS, qos.LATCHED)
-        self.odometry = [node.create_publisher(Odometry, names.ODOMETRY.format(robot), 10) for robot in range(3)]
-        for robot in range(3):
+        self.odometry = [node.create_publisher(Odometry, names.ODOMETRY.format(robot), 10) for robot in self.robots]
+        for robot in self.robots:
             for kind, topic, profile, heard in ((command, names.COMMAND, 10, self.commands),
                                                 (msg.Observation, names.OBSERVATION, qos.LATCHED_INPUT, self.observations),
                                                 (msg.Action, names.ACTION, qos.ROLLOUT, self.actions)):
@@ -92,12 +94,12 @@ class Stage(Listener):
         for status in message.status:
             self.diagnostics[status.name.strip('/')].append(status.message)
 
-    def wait_for_bridges(self, number: int) -> None:
+    def wait_for_bridges(self, number: int, landmarks: np.ndarray = LANDMARKS) -> None:
         """Shows the landmarks, and waits until bridges hear and are heard."""
-        self.landmarks.publish(convert_robots.landmarks_message(LANDMARKS, self.now, FRAME))
+        self.landmarks.publish(convert_robots.landmarks_message(landmarks, self.now, FRAME))
         self.spin_until(lambda: all(publisher.get_subscription_count() >= number for publisher in self.odometry))
         self.spin_until(lambda: self.clock.get_subscription_count() >= number)
-        self.spin_until(lambda: sum(self.node.count_publishers(names.COMMAND.format(robot)) for robot in range(3)) >= number)
+        self.spin_until(lambda: sum(self.node.count_publishers(names.COMMAND.format(robot)) for robot in self.robots) >= number)
 
     def show(self, robot: int, **changes) -> None:
         """Publishes the odometry of one robot, with fields of its pose changed."""
@@ -117,6 +119,19 @@ class Stage(Listener):
         self.tick(*shown)
         self.spin_until(lambda: len(self.commands[robot]) > count, lambda: f'no command; {self.diagnostics}')
         return self.commands[robot][-1]
+
+    def step(self, robots: Iterable[int], *shown: int) -> None:
+        """A tick in which these robots act. One that passes it over, since it was too busy, has to act in a later one."""
+        counts = {robot: len(self.actions[robot]) for robot in robots}
+        deadline = time.monotonic() + TIMEOUT
+
+        def have_acted() -> bool:
+            return all(len(self.actions[robot]) > count for robot, count in counts.items())
+
+        while not have_acted():
+            assert time.monotonic() < deadline, {name: said[-1] for name, said in self.diagnostics.items()}
+            self.tick(*shown)
+            self._holds_within(PATIENCE, have_acted)
 
     def tick_until(self, condition: Callable[[], bool], *shown: int) -> None:
         """Lets the clock go on, ten times as fast as at most, until `condition` holds; AssertionError if it never does."""

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from dae_ros_msgs import msg
 from hypothesis import example, given, settings, strategies
+from rclpy.serialization import serialize_message
 
 from dae_ros.errors import Refused
-from dae_ros.ros import convert
+from dae_ros.robots import standard_messages
+from dae_ros.robots.geometry import Pose
+from dae_ros.ros import convert, convert_robots
 from dae_ros.types import Action, JointState, Observation, PolicyWeights, RolloutRequest, SharedReward, Stamp
 from dae_ros.weights.codec import MAX_POLICY_BYTES
 
@@ -125,3 +128,23 @@ def test_weights_larger_than_any_policy_are_refused_before_they_are_copied(monke
     with pytest.raises(Refused) as refusal:
         convert.policy_weights(message)
     assert refusal.value.reason == Refused.OVERSIZED
+
+
+@pytest.mark.parametrize('world_frame', ['map', 'm', 'ma', 'odom', 'a/longer/one'])
+@pytest.mark.parametrize('child_frame', ['', 'b', 'base', 'robot_1/base_link', None])
+def test_odometry_is_read_from_its_bytes_as_from_the_message(world_frame, child_frame):
+    child_frame = world_frame if child_frame is None else child_frame
+    message = convert_robots.odometry_message(Pose((1.5, -2.5), 0.5, (0.3, 0.4), 12.25), 0.7, world_frame, child_frame)
+    message.pose.covariance[:], message.twist.covariance[:] = 3.0, 4.0
+    message.pose.pose.position.z = message.twist.twist.linear.z = 9.0
+    data = serialize_message(message)
+    assert standard_messages.odometry_in(data, world_frame) == (standard_messages.odometry(message, world_frame), child_frame)
+
+
+def test_bytes_that_are_no_odometry_are_refused():
+    message = convert_robots.odometry_message(Pose((1.5, -2.5), 0.5, (0.3, 0.4), 12.25), 0.7, 'map', 'base')
+    data, world_frame = serialize_message(message), 'map'
+    for wrong in [data[:length] for length in range(len(data))] + [b'\0\0' + data[2:], data[:12] + b'\xff' * (len(data) - 12)]:
+        with pytest.raises(Refused) as refused:
+            standard_messages.odometry_in(wrong, world_frame)
+        assert refused.value.reason in (Refused.CORRUPT, Refused.WRONG_FRAME)

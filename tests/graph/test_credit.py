@@ -6,16 +6,22 @@ import re
 from pathlib import Path
 
 import numpy as np
+from dae_ros_msgs import msg
 from geometry_msgs.msg import Vector3Stamped
 from harness import REPOSITORY, SMALL, Listener, bringup, finish, oracle
-from robots import Processes
+from robots import FRAME, PERIOD, PLACES, Processes, Stage
+from visualization_msgs.msg import MarkerArray
 
 from dae_ros import config
+from dae_ros.learning.credit import CreditMeter
 from dae_ros.learning.networks import make_reward_network
-from dae_ros.learning.reward_files import encode
+from dae_ros.learning.reward_files import encode, load
 from dae_ros.robots import standard_messages
-from dae_ros.ros import names, qos
+from dae_ros.robots.pilot import stamp_at
+from dae_ros.robots.setup import RUN
+from dae_ros.ros import convert, convert_robots, names, qos
 from dae_ros.ros.graph import watching
+from dae_ros.types import Action
 from dae_ros.worlds import world_spec
 
 WORLD, STEPS, UPDATES, ROLLOUTS = 3, 25, 5, 6  # the last rollout is the evaluation's
@@ -79,3 +85,58 @@ def test_bringup_has_the_trainer_tell_the_credit_of_the_world_it_is_asked_to_wat
         code, _, errors = finish(process)
     assert code == 0 and len(heard) == 2 * STEPS, f'{len(heard)} {errors}'
     assert all(np.isnan(message.vector.y) and np.isfinite([message.vector.x, message.vector.z]).all() for message in heard)
+
+
+def said(meter, states, actions, rewards) -> list[float]:
+    """What the library says that robot 1 earned, of messages heard and actions sent."""
+    found = []
+    for state in map(convert.joint_state, states):
+        meter.on_joint_state(state)
+        for action in actions:
+            if action.stamp == state.stamp:
+                meter.on_action(action)
+        for reward in map(convert.shared_reward, rewards):
+            credit = meter.on_reward(reward) if reward.stamp == state.stamp else None
+            found += [] if credit is None else [credit.differences[0, 1]]
+    return found
+
+
+def test_beside_robots_a_task_monitor_and_the_node_tell_and_show_who_earns_what(domain, tmp_path):
+    """The robots are put where they are by the test, which also acts for them: there is no trainer, no agent and no bridge."""
+    file, processes = network_file(tmp_path / 'networks.safetensors'), Processes(tmp_path)
+    told, shown, states, rewards, actions = [], [], [], [], []
+    draw = np.random.default_rng(1)
+    try:
+        with Stage() as stage:
+            for kind, topic, heard, profile in ((msg.JointState, names.JOINT_STATE, states, qos.ROLLOUT),
+                                                (msg.SharedReward, names.SHARED_REWARD, rewards, qos.ROLLOUT),
+                                                (Vector3Stamped, names.CREDIT.format(1), told, qos.ROLLOUT),
+                                                (MarkerArray, names.MARKERS, shown, qos.EVENTS)):
+                stage.node.create_subscription(kind, topic, heard.append, profile)
+            act = [stage.node.create_publisher(msg.Action, names.ACTION.format(robot), qos.ROLLOUT) for robot in range(3)]
+            processes.python('task_monitor', *documented('task_monitor'), '-p', 'use_sim_time:=true')
+            processes.python('credit', *documented('credit', file), '-p', 'use_sim_time:=true')
+            stage.landmarks.publish(convert_robots.landmarks_message(PLACES[::-1], stage.now, FRAME))
+            stage.spin_until(lambda: all(publisher.get_subscription_count() == 3 for publisher in act))  # and the stage's own
+            stage.spin_until(lambda: stage.node.count_subscribers(names.SHARED_REWARD) == 2)
+            stage.tick_until(lambda: bool(states) and bool(shown), 0, 1, 2)
+            for _ in range(60):  # more than two episodes
+                stage.places += draw.normal(scale=0.03, size=(3, 2))
+                stage.tick(0, 1, 2)
+                stamp = stamp_at(stage.now, PERIOD, STEPS, RUN)
+                stage.spin_until(lambda: convert.joint_state(states[-1]).stamp == stamp)
+                for robot, publisher in enumerate(act):
+                    weights = draw.dirichlet(np.ones(5)).astype(np.float32)
+                    chosen = np.array([weights.argmax()], np.uint16)
+                    actions.append(Action(stamp, robot, 0, chosen, weights[None]))
+                    publisher.publish(convert.action_message(actions[-1]))
+            stage.spin_until(lambda: len(told) > 25 and any(marker.ns == 'credit' for marker in shown[-1].markers),
+                             lambda: f'{len(told)} {processes.log("credit")}')
+        assert processes.end('credit') == processes.end('task_monitor') == 0
+    finally:
+        processes.stop()
+    differences, expected = [message.vector.y for message in told], said(CreditMeter(load(file), 0), states, actions, rewards)
+    assert np.ptp(differences) > 0.01 and all(np.isnan(message.vector.z) for message in told)
+    np.testing.assert_allclose(differences, expected[:len(differences)], rtol=1e-5, atol=1e-5)
+    texts = {float(marker.text) for array in shown for marker in array.markers if (marker.ns, marker.id) == ('credit', 1)}
+    assert texts <= {round(difference, 3) for difference in differences}

@@ -13,20 +13,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dae_ros_msgs import msg
 from geometry_msgs.msg import PoseArray, TwistStamped
 from harness import REPOSITORY, SMALL, TIMEOUT, processes_naming
 from nav_msgs.msg import Odometry
-from robots import LANDMARKS, PLACES, POLICY, Processes, Stage, is_standing
+from robots import LANDMARKS, PERIOD, PLACES, POLICY, Processes, Stage, is_standing
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from dae_ros.report.summary import Summary
 from dae_ros.robots import standard_messages
 from dae_ros.robots.acting import ActingEnd
-from dae_ros.ros import names, qos
+from dae_ros.robots.pilot import stamp_at
+from dae_ros.robots.setup import RUN
+from dae_ros.ros import convert, convert_robots, names, qos
 from dae_ros.weights.codec import decode_policy
 
 LAYOUTS, NEEDED = 20, 16
+BURST, EPISODE = 100, 25
 SECONDS = 8.0   # of simulated time for each layout
 SPEEDUP = 3.0
 CLOSE = 0.25    # m, mean distance of the landmarks to the nearest robot
@@ -126,18 +130,32 @@ def test_what_robots_do_does_not_change_when_trainer_and_parameter_server_are_ki
     for robot in everybody:
         stage.start_driving(robot, *everybody)
     graph.kill('trainer', 'parameter_server')
-    before = [len(stage.actions[robot]) for robot in everybody]
     for _ in range(40):  # more than an episode
-        stage.tick(*everybody)
-        for robot, count in enumerate(before):
-            stage.spin_until(lambda: len(stage.actions[robot]) > count)
-        before = [len(stage.actions[robot]) for robot in everybody]
+        stage.step(everybody, *everybody)
     policy, = (decode_policy(path.read_bytes()) for path in graph.folder.policies.glob('*/policy_*.safetensors'))
     for robot in everybody:
         acted, seen = stage.decoded(stage.actions[robot]), {item.stamp: item for item in stage.decoded(stage.observations[robot])}
         assert [action.actions[0] for action in acted] == answers_of(policy, [seen[action.stamp] for action in acted])
         assert {action.policy_version for action in acted} == {0}
     assert stage.call(Trigger, 'agent_0/activate_policy', Trigger.Request()).message == 'acting with policy version 0'
+
+
+def test_who_watches_passes_over_no_step_however_fast_simulated_time_runs(stage, processes):
+    processes.node('task_monitor', 'task_monitor', **SIMULATED)
+    states, everybody = [], (0, 1, 2)
+    stage.node.create_subscription(msg.JointState, names.JOINT_STATE, states.append, qos.ROLLOUT)
+    stage.landmarks.publish(convert_robots.landmarks_message(LANDMARKS, stage.now, 'map'))
+    stage.tick_until(lambda: bool(states), *everybody)
+    for _ in range(BURST):
+        stage.places += 0.01
+        stage.tick(*everybody)
+    last = stamp_at(stage.now, PERIOD, EPISODE, RUN)
+    stage.spin_until(lambda: convert.joint_state(states[-1]).stamp == last, lambda: str(states[-1].stamp))
+    began = [state for state in map(convert.joint_state, states) if state.stamp.step < EPISODE][-BURST:]
+    assert [EPISODE * state.stamp.rollout + state.stamp.step for state in began] == [
+        EPISODE * last.rollout + last.step - BURST + 1 + index for index in range(BURST)]
+    places = [state.observations[0, 0, 2:4] for state in began]
+    np.testing.assert_allclose(np.diff(places, axis=0), 0.01, atol=1e-5)  # each step with where everybody was then
 
 
 @pytest.mark.slow  # twenty layouts of eight seconds each, at three times real time
@@ -240,8 +258,7 @@ def test_the_commands_of_the_documentation_drive_a_robot(stage, processes):
 @pytest.mark.slow  # ten processes, one of them with torch
 def test_a_team_learns_in_a_stream_of_what_its_robots_do(domain, tmp_path):
     """Their agents and bridges, who watches them, trainer and parameter server."""
-    settings = ['num_worlds:=1', 'total_steps:=50', 'evaluation_episodes:=1', 'epochs:=1', 'reward_network.epochs:=1',
-                'real_time_factor:=3.0']  # a loaded machine loses steps of faster robots
+    settings = ['num_worlds:=1', 'total_steps:=50', 'evaluation_episodes:=1', 'epochs:=1', 'reward_network.epochs:=1']
     command = [sys.executable, '-m', 'dae_ros_nodes.bringup', 'streaming', '--stream', '--simulate', '--run-folder',
                str(tmp_path / 'run'), *(text for one in settings for text in ('-p', one))]
     done = subprocess.run(command, capture_output=True, text=True, timeout=2 * TIMEOUT)

@@ -1,0 +1,38 @@
+"""robot: the agent and the bridge of a trained team's robot in one process, or those of several robots.
+
+    ros2 run dae_ros robot --ros-args -p robot:=0 -p policy_file:=policy.safetensors
+    ros2 run dae_ros robot --ros-args -p robots:=3 -p execute:=true
+"""
+
+from __future__ import annotations
+
+import sys
+
+from dae_ros_nodes.robot_agent import DECLARED as OF_AGENT
+from dae_ros_nodes.robot_agent import RobotAgentNode
+from dae_ros_nodes.robot_bridge import DECLARED as OF_BRIDGE
+from dae_ros_nodes.robot_bridge import RobotBridgeNode, run_robots
+
+from dae_ros.errors import SettingsError
+from dae_ros.ros import names
+from dae_ros.ros.node import TeamNode, settings_of_process
+
+
+def make_robots() -> list[TeamNode]:
+    """The nodes of the robots that the command line asks for, `agent_<robot>` and `bridge_<robot>`. Raises SettingsError."""
+    asked = settings_of_process('robot', {info.name: info for info in (*OF_AGENT, *OF_BRIDGE)}.values())
+    nodes: list[TeamNode] = []
+    for robot in range(asked['robot'], asked['robot'] + asked['robots']):
+        nodes += [RobotAgentNode(names.agent_node(robot, 0, 1), robot=robot, robots=1),
+                  RobotBridgeNode(names.BRIDGE_NODE.format(robot), robot=robot, robots=1)]
+    if len({node.get_name() for node in nodes}) < len(nodes):
+        raise SettingsError(f'{len(nodes)} nodes cannot all be named {nodes[0].get_name()}; leave __node to each')
+    return nodes
+
+
+def main(args: list[str] | None = None) -> int:
+    return run_robots(make_robots, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
