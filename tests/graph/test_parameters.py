@@ -11,7 +11,7 @@ from harness import TIMEOUT, Listener
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 
-NODES = ('world', 'agent', 'parameter_server', 'trainer', 'robot_bridge', 'robot')
+NODES = ('world', 'agent', 'parameter_server', 'trainer', 'robot_bridge')
 
 
 def start(node: str, *arguments: str, cwd=None) -> subprocess.Popen:
@@ -47,6 +47,7 @@ def test_an_unknown_key_in_a_parameter_file_is_an_error_too(domain, tmp_path):
     ('agent', 'policy_file:=nowhere.safetensors', 'cannot read policy_file nowhere.safetensors: No such file'),
     ('agent', 'policy_file:=README.md', 'policy_file README.md is no policy'),
     ('robot_bridge', 'landmarks:="1 2, 3 4"', 'landmarks: 2 landmarks, the task has 3'),
+    ('robot', 'num_agnets:=4', "unknown setting 'num_agnets'; did you mean 'num_agents'?"),
     ('robot', 'robot:=3', 'robot must lie in 0 .. 2 where num_agents is 3, not 3'),
     ('world', 'task:=soccer', "unknown task 'soccer'"),
     ('world', 'group:=1', 'group must lie in 0 .. 0 where world_groups is 1, not 1'),
