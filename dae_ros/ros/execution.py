@@ -38,12 +38,12 @@ def execution_graph(values: dict[str, Any], policy_file: str, simulate: bool, ke
     if simulate:
         world = NodeProcess('world', 'world', {'real_time_factor': real_time_factor(values)})
         groups = process_groups(robots, values.get('robots_per_process', 0))
-        return [world, *(_robots(group, {**agent, **bridge}) for group in groups)]
+        return [world, *(robots_together(group, {**agent, **bridge}) for group in groups)]
     return [*(NodeProcess('agent', f'agent_{robot}', {'robot': robot, **agent}) for robot in robots),
             *(NodeProcess('robot_bridge', f'bridge_{robot}', {'robot': robot, **bridge}) for robot in robots)]
 
 
-def _robots(robots: range, parameters: dict[str, Any]) -> NodeProcess:
+def robots_together(robots: range, parameters: dict[str, Any]) -> NodeProcess:
     """Some robots of ours, all in one process."""
     nodes = tuple(name for robot in robots for name in (names.agent_node(robot, 0, 1), names.BRIDGE_NODE.format(robot)))
     parameters = {'robot': robots[0], 'robots': len(robots), **parameters}

@@ -19,6 +19,8 @@ from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import Trigger
 
 from dae_ros import config
+from dae_ros.learning.networks import make_reward_network
+from dae_ros.learning.reward_files import encode
 from dae_ros.report.summary import Summary
 from dae_ros.rollout.in_process import train
 from dae_ros.ros import names, qos
@@ -26,7 +28,7 @@ from dae_ros.ros.graph import NodeProcess, training_graph
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
-from dae_ros.worlds import make_worlds
+from dae_ros.worlds import make_worlds, world_spec
 
 TIMEOUT = 120  # s for anything a test waits for; a run takes a tenth of it
 ANSWER_TIMEOUT = 10  # s before a service is asked again
@@ -187,6 +189,14 @@ class Listener:
             self._holds_within(ANSWER_TIMEOUT, lambda: any(future.done() for future in futures))
         self.node.destroy_client(client)
         return next(future.result() for future in futures if future.done())
+
+
+def network_file(path: Path, values: dict = SMALL) -> Path:
+    """A file of reward networks that fit the task."""
+    settings = config.from_flat(values)
+    spec = world_spec(settings.task)
+    path.write_bytes(encode([make_reward_network(spec, settings.reward_network, 3, 0)], spec, settings.reward_network))
+    return path
 
 
 class Refusals:

@@ -8,31 +8,20 @@ from pathlib import Path
 import numpy as np
 from dae_ros_msgs import msg
 from geometry_msgs.msg import Vector3Stamped
-from harness import REPOSITORY, SMALL, Listener, bringup, finish, oracle
+from harness import REPOSITORY, SMALL, Listener, bringup, finish, network_file, oracle
 from robots import FRAME, PERIOD, PLACES, Processes, Stage
 from visualization_msgs.msg import MarkerArray
 
-from dae_ros import config
 from dae_ros.learning.credit import CreditMeter
-from dae_ros.learning.networks import make_reward_network
-from dae_ros.learning.reward_files import encode, load
+from dae_ros.learning.reward_files import load
 from dae_ros.robots import standard_messages
 from dae_ros.robots.pilot import stamp_at
 from dae_ros.robots.setup import RUN
 from dae_ros.ros import convert, convert_robots, names, qos
 from dae_ros.ros.graph import watching
 from dae_ros.types import Action
-from dae_ros.worlds import world_spec
 
 WORLD, STEPS, UPDATES, ROLLOUTS = 3, 25, 5, 6  # the last rollout is the evaluation's
-
-
-def network_file(path):
-    """A file of reward networks that fit the small task."""
-    settings = config.from_flat(SMALL)
-    spec = world_spec(settings.task)
-    path.write_bytes(encode([make_reward_network(spec, settings.reward_network, 3, 0)], spec, settings.reward_network))
-    return path
 
 
 def documented(executable, file=''):
