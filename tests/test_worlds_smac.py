@@ -5,6 +5,7 @@ import pytest
 
 from dae_ros.config import TaskSettings
 from dae_ros.errors import SettingsError, WorldError
+from dae_ros.types import WorldSpec
 from dae_ros.worlds import make_worlds
 
 GAME = '''
@@ -79,7 +80,7 @@ def actions_of(shown, first):
 
 def test_battles_are_played_as_smac_plays_them_and_begin_anew_where_they_end(smac):
     worlds = smac()
-    assert worlds.spec == (2, 4, 3, 5, False, True)
+    assert worlds.spec == WorldSpec(2, 4, 3, 5, state_is_observations=False, has_wins=True)
     shown = worlds.reset(1, 0)
     assert shown.episode_start.all() and shown.present.all() and not shown.available[..., 0].any()
     for step in range(1, 7):
