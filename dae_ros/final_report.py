@@ -31,7 +31,7 @@ def write_report(training: Training, folder: RunFolder) -> None:
         evaluation_standard_error=float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else None,
         evaluation_episodes=len(returns), yardsticks={name: list(value) for name, value in yardsticks.items()},
         weights_sha256=training.weights_sha256(),
-        evaluation_win_rate=float(training.won.mean()) if evaluated and training.spec.has_wins else None)
+        evaluation_win_rate=training.evaluation_win_rate)
     summary.write(folder.summary_file)
     title = f'{task.task}, {task.num_agents} robots, beta {settings.learner.beta:g}, seed {settings.run.seed}'
     plot_learning_curve(read_metrics(folder.metrics_file), yardsticks, title, folder.path / 'learning_curve.png')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from datetime import datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Mapping
 
@@ -13,6 +14,11 @@ from dae_ros.config import Settings
 from dae_ros.errors import Refused, RunFolderError
 from dae_ros.files import hold, remove_unfinished, write_atomically
 from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint
+
+
+def new_run(name: str) -> Path:
+    """Where a run of this name goes when nobody says where."""
+    return Path('runs') / f'{name}-{datetime.now():%Y%m%d-%H%M%S}'
 
 
 class RunFolder:

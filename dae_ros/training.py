@@ -106,6 +106,11 @@ class Training:
         return self.evaluating and len(self.evaluation) >= self.settings.run.evaluation_episodes
 
     @property
+    def evaluation_win_rate(self) -> float | None:
+        """Share of the evaluation's episodes that were won; None before there are any, and of worlds that have no wins."""
+        return float(self.won.mean()) if self.spec.has_wins and len(self.won) else None
+
+    @property
     def seconds(self) -> float:
         """Time spent since the first request, earlier runs of a resumed training included."""
         return self._seconds_before + (0.0 if self._began_at is None else time.monotonic() - self._began_at)

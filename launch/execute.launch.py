@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from dae_ros.ros.execution import execution_graph, find_policy, write_values
 from dae_ros.ros.graph import find_task_file, read_values
-from dae_ros.ros.launched import description, new_folder, nodes
+from dae_ros.ros.launched import description, nodes
+from dae_ros.run_folder import new_run
 
 
 def start(argument: dict[str, str]) -> list:
     """Agents and bridges of the team that the launch arguments describe."""
     values = read_values(find_task_file(argument['task_file']), argument['parameters'].split())
     processes = execution_graph(values, find_policy(argument['policy']), argument['simulate'] == 'true')
-    settings_file = write_values(values, new_folder('execution') / 'settings.yaml')
+    settings_file = write_values(values, new_run('execution').absolute() / 'settings.yaml')
     return nodes(processes, settings_file, argument['namespace'])
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from dae_ros.ros.execution import streaming_graph
 from dae_ros.ros.graph import find_task_file, read_settings, read_values
-from dae_ros.ros.launched import description, new_folder, nodes
-from dae_ros.run_folder import RunFolder
+from dae_ros.ros.launched import description, nodes
+from dae_ros.run_folder import RunFolder, new_run
 
 
 def start(argument: dict[str, str]) -> list:
@@ -18,7 +18,7 @@ def start(argument: dict[str, str]) -> list:
     task_file = find_task_file(argument['task_file'])
     overrides = argument['parameters'].split()
     settings, values = read_settings(task_file, overrides), read_values(task_file, overrides)
-    folder = RunFolder(Path(argument['run_folder'] or new_folder(task_file.stem)).absolute(), settings)
+    folder = RunFolder(Path(argument['run_folder'] or new_run(task_file.stem)).absolute(), settings)
     return nodes(streaming_graph(settings, values, folder, argument['simulate'] == 'true'), folder.settings_file,
                  argument['namespace'], settings.run.max_restarts)
 

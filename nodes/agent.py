@@ -22,10 +22,10 @@ from dae_ros.config import (
     check_group,
     declarations,
 )
-from dae_ros.errors import Refused, SettingsError
+from dae_ros.errors import Refused
 from dae_ros.rollout.lockstep import AgentEnd, check_run
 from dae_ros.ros import convert, names, qos
-from dae_ros.ros.node import TeamNode, is_over, run_together, settings_of_process
+from dae_ros.ros.node import TeamNode, check_names, is_over, run_together, settings_of_process
 from dae_ros.ros.trust import team_key
 from dae_ros.types import Action
 from dae_ros.weights.codec import open_weights
@@ -143,8 +143,7 @@ def make_agents() -> list[TeamNode]:
     if count == 1:
         return [make()]
     agents = [make(names.agent_node(robot, group, world_groups), robot=robot, robots=1) for robot in range(first, first + count)]
-    if len({agent.get_name() for agent in agents}) < count:
-        raise SettingsError(f'the agents of {count} robots cannot all be named {agents[0].get_name()}; leave __node to each')
+    check_names(agents, f'the agents of {count} robots')
     return agents
 
 

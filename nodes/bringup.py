@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -102,9 +101,10 @@ def execute(arguments: argparse.Namespace) -> None:
         from dae_ros.ros.execution import execution_graph, find_policy, write_values
         from dae_ros.ros.execution_run import ExecutionRun
         from dae_ros.ros.graph import read_values
+        from dae_ros.run_folder import new_run
 
     values = read_values(task_file_of(arguments), arguments.parameter)
-    folder = arguments.run_folder or Path('runs') / f'execution-{datetime.now():%Y%m%d-%H%M%S}'
+    folder = arguments.run_folder or new_run('execution')
     processes = execution_graph(values, find_policy(arguments.execute), arguments.simulate, arguments.key_file)
     print(f'driving; Ctrl-C stops the robots (logs of the nodes in {folder / "logs"})', flush=True)
     settings_file = write_values(values, folder / 'settings.yaml')
@@ -130,12 +130,12 @@ def bring_up(arguments: argparse.Namespace) -> int:
         from dae_ros.report.progress import ProgressDisplay
         from dae_ros.report.summary import Summary
         from dae_ros.ros.graph import read_settings
-        from dae_ros.run_folder import RunFolder
+        from dae_ros.run_folder import RunFolder, new_run
 
     task_file = task_file_of(arguments)
     settings = read_settings(task_file, arguments.parameter)
     stem = task_file.stem if task_file else settings.task.task.replace(':', '_')
-    path = arguments.run_folder or Path('runs') / f'{stem}-{datetime.now():%Y%m%d-%H%M%S}'
+    path = arguments.run_folder or new_run(stem)
     folder = RunFolder(path, settings)
     with ProgressDisplay() as display:
         display.note(f'training in {path} (logs of the nodes in {path / "logs"})')

@@ -13,9 +13,8 @@ from dae_ros_nodes.robot_agent import RobotAgentNode
 from dae_ros_nodes.robot_bridge import DECLARED as OF_BRIDGE
 from dae_ros_nodes.robot_bridge import RobotBridgeNode, run_robots
 
-from dae_ros.errors import SettingsError
 from dae_ros.ros import names
-from dae_ros.ros.node import TeamNode, settings_of_process
+from dae_ros.ros.node import TeamNode, check_names, settings_of_process
 
 
 def make_robots() -> list[TeamNode]:
@@ -25,8 +24,7 @@ def make_robots() -> list[TeamNode]:
     for robot in range(asked['robot'], asked['robot'] + asked['robots']):
         nodes += [RobotAgentNode(names.agent_node(robot, 0, 1), robot=robot, robots=1),
                   RobotBridgeNode(names.BRIDGE_NODE.format(robot), robot=robot, robots=1)]
-    if len({node.get_name() for node in nodes}) < len(nodes):
-        raise SettingsError(f'{len(nodes)} nodes cannot all be named {nodes[0].get_name()}; leave __node to each')
+    check_names(nodes, f'{len(nodes)} nodes')
     return nodes
 
 

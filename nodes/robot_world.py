@@ -12,7 +12,6 @@ from geometry_msgs.msg import PoseArray, TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
-from visualization_msgs.msg import MarkerArray
 
 from dae_ros.config import SETTINGS, BodySettings, RobotWorldSettings, TaskSettings, declarations
 from dae_ros.robots import standard_messages
@@ -22,7 +21,7 @@ from dae_ros.robots.pilot import stamp_at
 from dae_ros.robots.scene import Scene
 from dae_ros.robots.setup import limits_in, task_frame, task_settings
 from dae_ros.ros import convert_robots, names, qos
-from dae_ros.ros.markers import MARKERS_PERIOD, listen_for, markers
+from dae_ros.ros.markers import Display
 from dae_ros.ros.node import TeamNode
 
 try:
@@ -49,15 +48,13 @@ class RobotWorldNode(TeamNode):
         self._odometry = [self.publisher(Odometry, names.ODOMETRY.format(i), qos.NEWEST) for i in robots]
         self._landmarks = self.publisher(PoseArray, names.LANDMARKS, qos.LATCHED)
         self._scene = Scene(task.num_agents, self._bodies.radius)
-        self._markers = self.publisher(MarkerArray, names.MARKERS, qos.NEWEST)
+        self._display = Display(self, self._scene, self._world_frame, self._show)
         self._clock_out = self.publisher(Clock, names.CLOCK, qos.NEWEST) if self._is_clock else None
         self._transforms = TFMessage and self.publisher(TFMessage, names.TRANSFORMS, qos.EVENTS)
         for i in robots:
             self.listen(command, names.COMMAND.format(i), qos.SENSOR, partial(self._on_command, i))
-        self._watched = False  # whether anybody ever was shown the team
         self.create_service(Trigger, names.NEXT_EPISODE, self._on_next_episode)
         self._show_landmarks()
-        self.every(MARKERS_PERIOD, self._show)
         self.every(self._period / settings['real_time_factor'], self._tick)
 
     def now(self) -> float:
@@ -101,15 +98,10 @@ class RobotWorldNode(TeamNode):
         if self._is_clock:  # last, so that with each moment all is known of it
             self._clock_out.publish(Clock(clock=convert_robots.time_message(now)))
 
-    def _show(self) -> None:
-        if not self._markers.get_subscription_count():
-            return
-        if not self._watched:
-            self._watched = True
-            listen_for(self, self._scene)
+    def _show(self, now: float) -> bool:
         bodies = self._bodies
         self._scene.show(bodies.positions, bodies.headings, bodies.landmarks, bodies.targets)
-        self._markers.publish(markers(self._scene, self.now(), self._world_frame))
+        return True
 
     def _body_frame(self, robot: int) -> str:
         """Two teams have frames of their own, as they have topics of their own."""

@@ -11,7 +11,6 @@ from functools import partial
 from dae_ros_msgs import msg
 from geometry_msgs.msg import PoseArray
 from nav_msgs.msg import Odometry
-from visualization_msgs.msg import MarkerArray
 
 from dae_ros.config import BodySettings, BridgeSettings, RunBinding, TaskSettings, declarations
 from dae_ros.robots import standard_messages
@@ -19,7 +18,7 @@ from dae_ros.robots.pilot import LOOKS, without
 from dae_ros.robots.scene import Scene
 from dae_ros.robots.setup import make_watch
 from dae_ros.ros import convert, names, qos
-from dae_ros.ros.markers import MARKERS_PERIOD, listen_for, markers
+from dae_ros.ros.markers import Display
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.types import JointState
 
@@ -38,9 +37,7 @@ class TaskMonitorNode(TeamNode):
         self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
         self.as_time_goes_on(1.0 / (LOOKS * settings['control_rate']), self._look, qos.WATCHED)
         self._scene = Scene(settings['num_agents'], self._watch.radius)
-        self._markers = self.publisher(MarkerArray, names.MARKERS, qos.NEWEST)
-        self._watched = False  # whether anybody ever was shown the team
-        self.every(MARKERS_PERIOD, self._show)
+        self._display = Display(self, self._scene, self._world_frame, self._show)
 
     def _on_odometry(self, robot: int, data: bytes) -> None:
         now = self.now()
@@ -57,17 +54,12 @@ class TaskMonitorNode(TeamNode):
             else:
                 self._shared_reward.publish(convert.shared_reward_message(seen))
 
-    def _show(self) -> None:
+    def _show(self, now: float) -> bool:
         """Shows the team, unless our simulator plays it and does so itself."""
-        now = self.now()
-        if not self._markers.get_subscription_count():
-            return
-        if not self._watched:
-            self._watched = True
-            listen_for(self, self._scene)
-        if not self._watch.blind_for(now) and self.count_publishers(names.MARKERS) == 1:
-            self._watch.show(self._scene, now)
-            self._markers.publish(markers(self._scene, now, self._world_frame))
+        if self._watch.blind_for(now) or self.count_publishers(names.MARKERS) != 1:
+            return False
+        self._watch.show(self._scene, now)
+        return True
 
     def diagnose(self):
         now = self.now()

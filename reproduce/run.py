@@ -7,7 +7,6 @@ SETTINGS is a JSON object of settings by their names. The folder is a run's fold
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import platform
@@ -26,7 +25,7 @@ from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.credit_probe import AlternativesRecorder, accuracy, probe
 from dae_ros.errors import DaeRosError, RunFolderError
-from dae_ros.files import write_atomically
+from dae_ros.files import hold, write_atomically
 from dae_ros.report.metrics import MetricsLog
 from dae_ros.rollout.in_process import train
 from dae_ros.run_folder import RunFolder
@@ -52,11 +51,10 @@ def run(path: Path, settings: Settings, stopping: Callable[[], bool], exact: boo
     Raises Stopped once `stopping` holds, and RunFolderError if the folder is another run's or is in use.
     """
     path.mkdir(parents=True, exist_ok=True)
-    with open(path / 'lock', 'w') as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunFolderError(f'{path} is being trained by another process') from error
+    lock = hold(path / 'lock')
+    if lock is None:
+        raise RunFolderError(f'{path} is being trained by another process')
+    with lock:
         if pretrained:
             def check() -> None:
                 if stopping():
@@ -132,11 +130,11 @@ def _but_for_length(settings: Settings) -> Settings:
 
 
 def _result(training: Training) -> Mapping[str, Any]:
-    returns, won = training.evaluation, training.won
+    returns = training.evaluation
     return {'environment_steps': training.environment_steps, 'seconds': training.seconds,
             'steps_per_second': training.environment_steps / training.seconds,
             'evaluation_return': float(returns.mean()) if len(returns) else None, 'evaluation_episodes': len(returns),
-            'evaluation_win_rate': float(won.mean()) if len(won) and training.spec.has_wins else None,
+            'evaluation_win_rate': training.evaluation_win_rate,
             'weights_sha256': training.weights_sha256()}
 
 

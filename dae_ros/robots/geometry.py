@@ -6,7 +6,7 @@ Frames are right-handed, x forward and y to the left in a body; angles in rad, c
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Sequence
 
 import numpy as np
 
@@ -68,6 +68,11 @@ class TaskFrame(NamedTuple):
     def metres(self, positions: np.ndarray) -> np.ndarray:
         """Positions [..., 2] in the robots' world, in m, of those in task units."""
         return np.asarray(positions, np.float64) * self.scale + self.origin
+
+    def placed(self, poses: Sequence[Pose], landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions [N, 2] and velocities [N, 2] of robots with these poses, and landmarks [L, 2] given in m, in task units."""
+        return (self.positions([pose.position for pose in poses]), self.velocities([pose.velocity for pose in poses]),
+                self.positions(landmarks))
 
     def velocities(self, metres_per_second: np.ndarray) -> np.ndarray:
         """Velocities [..., 2] in task units per second of the task."""

@@ -114,9 +114,7 @@ class Pilot:
 
     def _observe(self, step: Stamp, now: float) -> Observation:
         poses = [track.held(now) for track in self._safety.tracks]
-        observations, _ = self._monitor.observe(self._frame.positions([pose.position for pose in poses]),
-                                                self._frame.velocities([pose.velocity for pose in poses]),
-                                                self._frame.positions(self._landmarks))
+        observations, _ = self._monitor.observe(*self._frame.placed(poses, self._landmarks))
         start = not self._moving or step.rollout != self._seen.rollout
         self._seen, self._moving = step, True
         self._asked = {stamp: asked for stamp, asked in self._asked.items() if self._safety.waits(asked, now)}

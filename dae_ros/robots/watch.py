@@ -86,10 +86,7 @@ class Watch:
         return ~np.isin(np.arange(len(self.tracks)), list(self._left))[None] if self._left else None
 
     def _see(self, now: float) -> Sight:
-        poses = [track.held(now) for track in self.tracks]
-        return self._monitor.see(self._frame.positions([pose.position for pose in poses]),
-                                 self._frame.velocities([pose.velocity for pose in poses]),
-                                 self._frame.positions(self._landmarks))
+        return self._monitor.see(*self._frame.placed([track.held(now) for track in self.tracks], self._landmarks))
 
 
 def _joint_state(stamp: Stamp, sight: Sight, present: np.ndarray | None = None) -> JointState:

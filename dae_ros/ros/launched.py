@@ -5,7 +5,6 @@ Needs `launch` and `launch_ros`, which a full ROS installation has.
 
 from __future__ import annotations
 
-from datetime import datetime
 from pathlib import Path
 from typing import Callable
 
@@ -37,11 +36,6 @@ def description(names: tuple[str, ...], start: Callable[[dict[str, str]], list],
         declared.append(DeclareLaunchArgument(name, default_value=defaults.get(name, default), description=text))
     return LaunchDescription([*declared, OpaqueFunction(
         function=lambda context: start({name: LaunchConfiguration(name).perform(context) for name in names}))])
-
-
-def new_folder(name: str) -> Path:
-    """Where a run of this name goes when nobody says where."""
-    return Path(f'runs/{name}-{datetime.now():%Y%m%d-%H%M%S}').absolute()
 
 
 def nodes(processes: list[NodeProcess], settings_file: Path, namespace: str, max_restarts: int | None = None) -> list:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Iterable, Iterator
+from typing import Callable, Iterable, Iterator
 
 import numpy as np
 from dae_ros_msgs import msg
@@ -19,7 +19,7 @@ from dae_ros.ros.node import TeamNode
 ROBOT, HEADING, LANDMARK, TARGET, TRAIL, CONTACT, ACTION, CREDIT = (ColorRGBA(r=r, g=g, b=b, a=a) for r, g, b, a in (
     (0.0, 0.45, 0.70, 1.0), (1.0, 1.0, 1.0, 1.0), (0.84, 0.37, 0.0, 1.0), (0.0, 0.62, 0.45, 0.35), (0.0, 0.45, 0.70, 0.5),
     (0.80, 0.0, 0.0, 1.0), (0.95, 0.90, 0.25, 0.9), (0.0, 0.0, 0.0, 1.0)))
-MARKERS_PERIOD = 0.1   # s
+PERIOD = 0.1           # s between two displays
 HEIGHT = 0.5           # of a robot, in radii
 ARROW = 4.0            # radii of an arrow for an action that is certain
 LEAST_PROBABLE = 0.02  # action that is shown
@@ -47,15 +47,35 @@ def markers(scene: Scene, time: float, world_frame: str) -> MarkerArray:
     return MarkerArray(markers=team)
 
 
-def listen_for(node: TeamNode, scene: Scene) -> None:
-    """Has the node take in what agents do, and what a trainer or a credit node says they earn."""
-    def on_credit(robot: int, message: Vector3Stamped) -> None:
-        if np.isfinite(message.vector.y):
-            scene.earned[robot] = message.vector.y
+class Display:
+    """Publishes a node's scene as markers while somebody looks, and listens to what agents do and earn from then on."""
 
-    for robot in range(len(scene.trails)):
-        node.listen(msg.Action, names.ACTION.format(robot), qos.EVENTS, lambda message: scene.on_action(convert.action(message)))
-        node.listen(Vector3Stamped, names.CREDIT.format(robot), qos.EVENTS, partial(on_credit, robot))
+    def __init__(self, node: TeamNode, scene: Scene, world_frame: str, update: Callable[[float], bool]):
+        """`update` brings the scene up to date for a time [s], and says whether it is to be shown."""
+        self._node, self._scene, self._world_frame, self._update = node, scene, world_frame, update
+        self._publisher = node.publisher(MarkerArray, names.MARKERS, qos.NEWEST)
+        self._watched = False  # whether anybody ever looked
+        node.every(PERIOD, self._show)
+
+    def _show(self) -> None:
+        if not self._publisher.get_subscription_count():
+            return
+        if not self._watched:
+            self._watched = True
+            self._listen()
+        now = self._node.now()
+        if self._update(now):
+            self._publisher.publish(markers(self._scene, now, self._world_frame))
+
+    def _listen(self) -> None:
+        for robot in range(len(self._scene.trails)):
+            self._node.listen(msg.Action, names.ACTION.format(robot), qos.EVENTS,
+                              lambda message: self._scene.on_action(convert.action(message)))
+            self._node.listen(Vector3Stamped, names.CREDIT.format(robot), qos.EVENTS, partial(self._on_credit, robot))
+
+    def _on_credit(self, robot: int, message: Vector3Stamped) -> None:
+        if np.isfinite(message.vector.y):
+            self._scene.earned[robot] = message.vector.y
 
 
 def _size(diameter: float, height: float) -> tuple[float, float, float]:

@@ -27,7 +27,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from dae_ros.command import refuse
 from dae_ros.config import SettingInfo
-from dae_ros.errors import DaeRosError, Refused
+from dae_ros.errors import DaeRosError, Refused, SettingsError
 from dae_ros.robots.standard_messages import seconds
 from dae_ros.ros import names, params, qos, shared_memory
 from dae_ros.ros.clock_watch import ClockWatch
@@ -198,6 +198,12 @@ def set_timers_anew(nodes: Iterable[Node]) -> None:
             timer.reset()
 
 
+def check_names(nodes: list[TeamNode], who: str) -> None:
+    """SettingsError where nodes of one process, `who` in words, have the same name: one that the command line gave them all."""
+    if len({node.get_name() for node in nodes}) < len(nodes):
+        raise SettingsError(f'{who} cannot all be named {nodes[0].get_name()}; leave __node to each')
+
+
 def settings_of_process(name: str, declared: Iterable[SettingInfo]) -> dict[str, Any]:
     """What the command line says before the nodes are made whose number and kind depend on it. Raises SettingsError.
 
@@ -245,9 +251,9 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
             while rclpy.ok():
                 executor.spin_once(LONG)
                 for node in nodes:
-                    if isinstance(node.failure, DaeRosError):
-                        node.say_why(node.failure)
                     if node.failure is not None:
+                        if isinstance(node.failure, DaeRosError):
+                            node.say_why(node.failure)
                         raise node.failure
                     if node.done:
                         return 0
