@@ -149,10 +149,11 @@ def read_values(task_file: Path | None, overrides: Iterable[str]) -> dict[str, A
 def node_environment() -> dict[str, str]:
     """Environment variables for the nodes where the user has set none: this host only, and quick discovery."""
     reach = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-    # SYSTEM_DEFAULT leaves it to the profile; LOCALHOST would overrule it and let only 32 processes find each other.
-    chosen = any(name in os.environ for name in (reach, _PROFILES, 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER'))
-    defaults = ({reach: 'LOCALHOST', _PROFILES: _profiles('fastdds.xml')} if chosen else
-                {reach: 'SYSTEM_DEFAULT', _PROFILES: _profiles('fastdds_this_host.xml')})
+    chosen = any(name in os.environ for name in (_PROFILES, 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER'))
+    if not chosen and os.environ.get(reach, 'LOCALHOST').upper() == 'LOCALHOST':
+        # The profile reaches as far; LOCALHOST itself would let only 32 processes find each other, and bring shared memory back.
+        return {reach: 'SYSTEM_DEFAULT', _PROFILES: _profiles('fastdds_this_host.xml')}
+    defaults = {reach: 'LOCALHOST', _PROFILES: _profiles('fastdds.xml')}
     return {name: os.environ.get(name, value) for name, value in defaults.items()}
 
 

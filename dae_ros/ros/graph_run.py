@@ -14,7 +14,6 @@ from dae_ros.errors import DaeRosError
 from dae_ros.report.progress import ProgressDisplay
 from dae_ros.restarts import Restarts, SignsOfLife
 from dae_ros.ros import names, qos
-from dae_ros.ros.clock_watch import ClockWatch
 from dae_ros.ros.graph import NodeProcess
 from dae_ros.ros.process_run import ProcessRun
 from dae_ros.run_folder import RunFolder
@@ -37,15 +36,6 @@ class GraphRun(ProcessRun):
         self._signs = SignsOfLife(settings.run.silence_timeout)
         self._newest = 0  # policy version
         self._detail = ''
-        self._unnoticed_until = 0.0  # by Fast DDS, who dies; s, monotonic
-        self._anew: set[str] = set()  # who was asked to end, to be started again
-
-    def run(self) -> None:
-        watch = ClockWatch(self._later(self._on_clock_set))
-        try:
-            super().run()
-        finally:
-            watch.close()
 
     def _listen(self, node: Node) -> None:
         node.create_subscription(TrainingStatus, names.TRAINING_STATUS, self._later(self._on_status), qos.LATCHED_INPUT)
@@ -95,27 +85,10 @@ class GraphRun(ProcessRun):
 
     def _on_exit(self, name: str, code: int) -> None:
         self._signs.ended(name)
-        if name in self._anew:
-            self._anew.remove(name)
-            self._due[name] = time.monotonic()
-        elif (name, code) != ('trainer', 0):
+        if (name, code) != ('trainer', 0):
             super()._on_exit(name, code)
-            if time.monotonic() < self._unnoticed_until:
-                self._start_others_anew(name)
         elif not self._folder.summary_file.exists():
             raise DaeRosError('the trainer was stopped before its end; '
                               f'--run-folder {self._folder.path} goes on from there')
         else:
             self._finished = True
-
-    def _on_clock_set(self, seconds: float) -> None:
-        """Until it is where it was before it was set back, Fast DDS does not look who has died in shared memory."""
-        self._unnoticed_until = max(self._unnoticed_until, time.monotonic()) - seconds
-
-    def _start_others_anew(self, dead: str) -> None:
-        """Those who knew the dead one would go on talking to it, and not to who comes in its place."""
-        others = [name for name in self._processes if name != dead and name not in self._due and name not in self._anew]
-        self._note('the clock was set back, so the other nodes are started again too')
-        self._anew.update(others)
-        for name in others:
-            self._supervisor.ask(name)

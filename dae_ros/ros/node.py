@@ -29,7 +29,7 @@ from dae_ros.command import refuse
 from dae_ros.config import SettingInfo
 from dae_ros.errors import DaeRosError, Refused, SettingsError
 from dae_ros.robots.standard_messages import seconds
-from dae_ros.ros import names, params, qos, shared_memory
+from dae_ros.ros import names, params, qos, transport
 from dae_ros.ros.clock_watch import ClockWatch
 
 try:
@@ -237,7 +237,7 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
     signal.signal(signal.SIGINT, interrupt)  # rclpy's handler, which shuts the context down, calls this one
     try:
         try:
-            shared_memory.remove_half_made_ports()
+            transport.choose()
             rclpy.init(args=args)
             nodes += make_nodes()
             executor = Executor()

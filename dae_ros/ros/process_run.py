@@ -18,7 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dae_ros.errors import DaeRosError
 from dae_ros.restarts import Restarts, describe
-from dae_ros.ros import shared_memory
+from dae_ros.ros import transport
 from dae_ros.ros.graph import NodeProcess, enclave_arguments, node_environment
 from dae_ros.ros.supervisor import Supervisor
 
@@ -45,8 +45,8 @@ class ProcessRun:
     def run(self) -> None:
         """Returns when the run is finished. Raises DaeRosError when it cannot go on; no process is left either way."""
         os.environ.update(node_environment())  # for this process too: it must hear the others
+        transport.choose()
         enclave = enclave_arguments('bringup', self._namespace)
-        shared_memory.remove_half_made_ports()
         rclpy.init(args=['--ros-args', *enclave], signal_handler_options=SignalHandlerOptions.NO)
         node = rclpy.create_node('bringup', namespace=self._namespace, start_parameter_services=False)
         self._process_of = {f'{node.get_namespace().rstrip("/")}/{name}': process.name
@@ -54,7 +54,6 @@ class ProcessRun:
         self._listen(node)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        began = time.time()
 
         def spin() -> None:
             try:
@@ -79,7 +78,6 @@ class ProcessRun:
             rclpy.try_shutdown()
             if spinning.ident is not None:
                 spinning.join()
-            shared_memory.remove_left_behind(began)
 
     def _listen(self, node: Node) -> None:
         """Makes the subscriptions that are needed; their callbacks go through `_later`."""

@@ -61,12 +61,6 @@ class Supervisor:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
 
-    def ask(self, name: str) -> None:
-        """Asks a process to end."""
-        process = self._processes[name]
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGTERM)
-
     def log_file(self, name: str) -> Path:
         """Where the process's output goes."""
         return self._log_folder / f'{name}.log'
