@@ -22,8 +22,8 @@ def make_robots() -> list[TeamNode]:
     asked = settings_of_process('robot', {info.name: info for info in (*OF_AGENT, *OF_BRIDGE)}.values())
     nodes: list[TeamNode] = []
     for robot in range(asked['robot'], asked['robot'] + asked['robots']):
-        nodes += [RobotAgentNode(names.agent_node(robot, 0, 1), robot=robot, robots=1),
-                  RobotBridgeNode(names.BRIDGE_NODE.format(robot), robot=robot, robots=1)]
+        agent = RobotAgentNode(names.agent_node(robot, 0, 1), beside_bridge=True, robot=robot, robots=1)
+        nodes += [agent, RobotBridgeNode(names.BRIDGE_NODE.format(robot), agent, robot=robot, robots=1)]
     check_names(nodes, f'{len(nodes)} nodes')
     return nodes
 

@@ -14,10 +14,12 @@ from dae_ros_msgs import msg
 from std_srvs.srv import Trigger
 
 from dae_ros.config import SETTINGS, AgentSettings, ExecutionSettings, RunBinding, TeamKey, declarations
+from dae_ros.errors import Refused
 from dae_ros.robots.acting import ActingEnd
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode
 from dae_ros.ros.trust import team_key
+from dae_ros.types import Action, Observation
 from dae_ros.weights.codec import decode_policy, open_weights, read_file
 
 DECLARED = [*declarations(AgentSettings, ExecutionSettings, RunBinding, TeamKey), SETTINGS['seed']]
@@ -28,9 +30,11 @@ REMEMBERED = 1000  # answers whose times are shown
 class RobotAgentNode(TeamNode):
     """Wires an `ActingEnd` to its robot's topics."""
 
-    def __init__(self, name: str = 'agent', **given: int):
+    def __init__(self, name: str = 'agent', beside_bridge: bool = False, **given: int):
+        """`beside_bridge`: the robot's bridge is in this process and calls `answer` itself."""
         super().__init__(name, DECLARED, **given)
         robot, path = self.settings['robot'], self.settings['policy_file']
+        self._topic = names.OBSERVATION.format(robot)
         self._end = ActingEnd(robot, self.settings['greedy'], self.settings['seed'], self.settings['run'])
         self._taken: deque[float] = deque(maxlen=REMEMBERED)
         self._actions = self.publisher(msg.Action, names.ACTION.format(robot), qos.ROLLOUT)
@@ -41,14 +45,24 @@ class RobotAgentNode(TeamNode):
             self._key = team_key(self, self.settings['key_file'])
             self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED_INPUT, self._on_policy)
         self.create_service(Trigger, names.ACTIVATE_POLICY, self._on_activate)
-        self.listen(msg.Observation, names.OBSERVATION.format(robot), qos.LATCHED_INPUT, self._on_observation)
+        if not beside_bridge:
+            self.listen(msg.Observation, self._topic, qos.LATCHED_INPUT,
+                        lambda message: self._act(time.perf_counter(), convert.observation(message)))
 
-    def _on_observation(self, message: msg.Observation) -> None:
-        began = time.perf_counter()
-        action = self._end.on_observation(convert.observation(message))
+    def answer(self, observation: Observation) -> Action | None:
+        """The action, which all are told; None while there is no policy, and where the observation is refused and counted."""
+        try:
+            return self._act(time.perf_counter(), observation)
+        except Refused as refusal:
+            self.refuse(self._topic, refusal)
+            return None
+
+    def _act(self, began: float, observation: Observation) -> Action | None:
+        action = self._end.on_observation(observation)
         if action is not None:
             self._actions.publish(convert.action_message(action))
             self._taken.append(time.perf_counter() - began)
+        return action
 
     def _on_policy(self, message: msg.PolicyWeights) -> None:
         weights = convert.policy_weights(message)

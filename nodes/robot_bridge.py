@@ -13,6 +13,7 @@ from typing import Callable
 
 import rclpy
 from dae_ros_msgs import msg
+from dae_ros_nodes.robot_agent import RobotAgentNode
 from geometry_msgs.msg import PoseArray, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
@@ -27,6 +28,7 @@ from dae_ros.robots.safety import Stop
 from dae_ros.robots.setup import landmarks_in, make_pilot
 from dae_ros.ros import convert, convert_robots, names, qos
 from dae_ros.ros.node import TeamNode, run_together
+from dae_ros.types import Action, Observation
 
 DECLARED = [*declarations(AgentSettings, TaskSettings, BodySettings, BridgeSettings, RunBinding)]
 LAST_WORD = Duration(seconds=0.5)  # for the last command to arrive
@@ -35,8 +37,10 @@ LAST_WORD = Duration(seconds=0.5)  # for the last command to arrive
 class RobotBridgeNode(TeamNode):
     """Wires a `Pilot` to the topics of its robot and the team's odometry."""
 
-    def __init__(self, name: str = 'robot_bridge', **given: int):
+    def __init__(self, name: str = 'robot_bridge', agent: RobotAgentNode | None = None, **given: int):
+        """`agent`: the robot's, where it is in this process; others are told what both say, but neither waits for the network."""
         super().__init__(name, DECLARED, **given)
+        self._agent = agent
         settings = self.settings
         robot, self._world_frame, self._stamped = settings['robot'], settings['world_frame'], settings['stamped']
         self._body_frame = ''
@@ -50,7 +54,8 @@ class RobotBridgeNode(TeamNode):
             self._take_landmarks(settings['landmarks'])
         else:
             self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
-        self.listen(msg.Action, names.ACTION.format(robot), qos.EVENTS, self._on_action)
+        if agent is None:
+            self.listen(msg.Action, names.ACTION.format(robot), qos.EVENTS, lambda message: self._obey(convert.action(message)))
         self.create_service(SetBool, names.ENABLE, self._on_enable)
         self.as_time_goes_on(1.0 / (LOOKS * settings['control_rate']), self._look, qos.NOW)
 
@@ -79,8 +84,16 @@ class RobotBridgeNode(TeamNode):
         except Refused as refusal:
             raise SettingsError(f'landmarks: {refusal.detail}') from refusal
 
-    def _on_action(self, message: msg.Action) -> None:
-        self._send(self._pilot.on_action(convert.action(message)))
+    def _obey(self, action: Action) -> None:
+        self._send(self._pilot.on_action(action))
+
+    def _ask(self, agent: RobotAgentNode, observation: Observation) -> None:
+        action = agent.answer(observation)
+        try:
+            if action is not None:
+                self._obey(action)
+        except Refused as refusal:
+            self.refuse(names.ACTION.format(self.settings['robot']), refusal)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._pilot.enable(request.data)
@@ -96,6 +109,8 @@ class RobotBridgeNode(TeamNode):
             self._send(turn.command)
         if turn.observation is not None:
             self._observations.publish(convert.observation_message(turn.observation))
+            if self._agent is not None:
+                self._ask(self._agent, turn.observation)
         stop = self._pilot.stop
         if (stop and stop.reason) != (before and before.reason):
             self.get_logger().info('driving' if stop is None else f'standing: {stop.detail}')

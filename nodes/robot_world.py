@@ -91,7 +91,7 @@ class RobotWorldNode(TeamNode):
                 self._begin(episode)
         self._bodies.move(now, self._period)
         for robot, publisher in enumerate(self._odometry):
-            publisher.publish(convert_robots.odometry_message(self._bodies.pose(robot, now), float(self._bodies.turns[robot]),
+            publisher.publish(standard_messages.odometry_data(self._bodies.pose(robot, now), float(self._bodies.turns[robot]),
                                                               self._world_frame, self._body_frame(robot)))
         if self._transforms:
             self._transforms.publish(TFMessage(transforms=[self._transform(robot, now) for robot in range(len(self._odometry))]))

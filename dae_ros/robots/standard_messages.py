@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dae_ros.errors import Refused
-from dae_ros.robots.geometry import Pose, heading_of, turned
+from dae_ros.robots.geometry import Pose, heading_of, quaternion_of, turned
 from dae_ros.robots.motion import Command
 
 NANOSECONDS = 1_000_000_000
@@ -16,6 +16,7 @@ NANOSECONDS = 1_000_000_000
 _LITTLE_ENDIAN, _ENCAPSULATION = b'\x00\x01', 4  # how serialised messages begin; alignment does not count these bytes
 _TIME, _LENGTH = struct.Struct('<iI'), struct.Struct('<I')
 _NUMBERS = struct.Struct('<7d288x2d320x')  # pose, its covariance, the twist's x and y, the rest of it and its covariance
+_WRITTEN = struct.Struct('<7d288x2d24xd288x')  # the same with the twist's turn about z
 
 
 def seconds(time: Any) -> float:
@@ -47,6 +48,17 @@ def odometry_in(data: bytes, world_frame: str) -> tuple[Pose, str]:
         raise Refused(Refused.CORRUPT, f'{len(data)} bytes that are no odometry') from error
     pose = _pose(frame, child_frame, numbers[0:2], numbers[3:7], numbers[7:9], second + nanosecond / NANOSECONDS, world_frame)
     return pose, child_frame
+
+
+def odometry_data(pose: Pose, turn: float, world_frame: str, body_frame: str) -> bytes:
+    """A serialised nav_msgs/Odometry, with its twist in the body's frame and covariances of 0; `turn` in rad/s."""
+    data = bytearray(_LITTLE_ENDIAN + b'\x00\x00' + _TIME.pack(*divmod(round(pose.time * NANOSECONDS), NANOSECONDS)))
+    for text, alignment in ((world_frame, _LENGTH.size), (body_frame, 8)):
+        characters = text.encode() + b'\x00'
+        data += _LENGTH.pack(len(characters)) + characters
+        data += bytes((_ENCAPSULATION - len(data)) % alignment)
+    velocity = turned(pose.velocity, -pose.heading)
+    return bytes(data + _WRITTEN.pack(*pose.position, 0.0, *quaternion_of(pose.heading), *velocity, turn))
 
 
 def _text(data: bytes, begin: int) -> tuple[str, int]:

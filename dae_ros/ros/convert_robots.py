@@ -8,9 +8,8 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseArray, Quaternion, TransformStamped, Twist, TwistStamped, Vector3, Vector3Stamped
 from geometry_msgs.msg import Pose as PoseMessage
-from nav_msgs.msg import Odometry
 
-from dae_ros.robots.geometry import Pose, quaternion_of, turned
+from dae_ros.robots.geometry import Pose, quaternion_of
 from dae_ros.robots.motion import Command
 from dae_ros.robots.standard_messages import NANOSECONDS
 
@@ -21,16 +20,6 @@ if TYPE_CHECKING:
 def time_message(time: float) -> Time:
     whole, part = divmod(round(time * NANOSECONDS), NANOSECONDS)
     return Time(sec=whole, nanosec=part)
-
-
-def odometry_message(pose: Pose, turn: float, world_frame: str, body_frame: str) -> Odometry:
-    """`turn`: rad/s."""
-    message = Odometry(child_frame_id=body_frame)
-    message.header.frame_id, message.header.stamp = world_frame, time_message(pose.time)
-    message.pose.pose = pose_message(pose.position, pose.heading)
-    forward, left = turned(pose.velocity, -pose.heading)
-    message.twist.twist = Twist(linear=Vector3(x=forward, y=left), angular=Vector3(z=turn))
-    return message
 
 
 def transform_message(pose: Pose, world_frame: str, body_frame: str) -> TransformStamped:

@@ -124,12 +124,12 @@ def _robots(team: Team, policy: tuple[str, ...]) -> dict[str, Access]:
     if team.simulate:
         access['world'] = Access((*odometry, names.LANDMARKS, names.MARKERS, *team.clock, names.TRANSFORMS),
                                  (*commands, *actions, *credit), (names.NEXT_EPISODE,))
-    for robot, observation in enumerate(team.of_each(names.OBSERVATION)):
-        access[names.agent_node(robot, 0, 1)] = Access((actions[robot],), (observation, *policy, *team.clock),
-                                                       (names.ACTIVATE_POLICY,))
+    for robot, (observation, action) in enumerate(zip(team.of_each(names.OBSERVATION), actions)):
+        # Where our simulator plays the robots, agent and bridge share a process and hear each other without the network.
+        asked, answered = ((), ()) if team.simulate else ((observation,), (action,))
+        access[names.agent_node(robot, 0, 1)] = Access((action,), (*asked, *policy, *team.clock), (names.ACTIVATE_POLICY,))
         access[names.BRIDGE_NODE.format(robot)] = Access((commands[robot], observation),
-                                                           (*odometry, names.LANDMARKS, actions[robot], *team.clock),
-                                                           (names.ENABLE,))
+                                                         (*odometry, names.LANDMARKS, *answered, *team.clock), (names.ENABLE,))
     access['task_monitor'] = Access((*STATES, names.MARKERS), (*odometry, names.LANDMARKS, *actions, *credit, *team.clock))
     access['credit'] = _credit(team)
     return access

@@ -19,6 +19,7 @@ from harness import REPOSITORY, TIMEOUT, Listener
 from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 
+from dae_ros.robots import standard_messages
 from dae_ros.robots.geometry import Pose
 from dae_ros.ros import convert, convert_robots, names, qos
 from dae_ros.ros.supervisor import Supervisor
@@ -104,7 +105,7 @@ class Stage(Listener):
     def show(self, robot: int, **changes) -> None:
         """Publishes the odometry of one robot, with fields of its pose changed."""
         pose = Pose(tuple(self.places[robot]), 0.0, (0.0, 0.0), self.now)._replace(**changes)
-        self.odometry[robot].publish(convert_robots.odometry_message(pose, 0.0, FRAME, f'robot_{robot}/base_link'))
+        self.odometry[robot].publish(standard_messages.odometry_data(pose, 0.0, FRAME, f'robot_{robot}/base_link'))
 
     def tick(self, *robots: int, fraction: float = 1.0) -> None:
         """The clock goes on by a control period, or a fraction of one; only these robots show their odometry."""

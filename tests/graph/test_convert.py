@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from dae_ros_msgs import msg
 from hypothesis import example, given, settings, strategies
-from rclpy.serialization import serialize_message
+from nav_msgs.msg import Odometry
+from rclpy.serialization import deserialize_message, serialize_message
 
 from dae_ros.errors import Refused
 from dae_ros.robots import standard_messages
-from dae_ros.robots.geometry import Pose
-from dae_ros.ros import convert, convert_robots
+from dae_ros.robots.geometry import Pose, turned
+from dae_ros.ros import convert
 from dae_ros.types import Action, JointState, Observation, PolicyWeights, RolloutRequest, SharedReward, Stamp
 from dae_ros.weights.codec import MAX_POLICY_BYTES
 
@@ -130,20 +133,33 @@ def test_weights_larger_than_any_policy_are_refused_before_they_are_copied(monke
     assert refusal.value.reason == Refused.OVERSIZED
 
 
+POSE = Pose((1.5, -2.5), 0.5, (0.3, 0.4), 12.25)
+
+
 @pytest.mark.parametrize('world_frame', ['map', 'm', 'ma', 'odom', 'a/longer/one'])
 @pytest.mark.parametrize('child_frame', ['', 'b', 'base', 'robot_1/base_link', None])
 def test_odometry_is_read_from_its_bytes_as_from_the_message(world_frame, child_frame):
     child_frame = world_frame if child_frame is None else child_frame
-    message = convert_robots.odometry_message(Pose((1.5, -2.5), 0.5, (0.3, 0.4), 12.25), 0.7, world_frame, child_frame)
+    message = deserialize_message(standard_messages.odometry_data(POSE, 0.7, world_frame, child_frame), Odometry)
     message.pose.covariance[:], message.twist.covariance[:] = 3.0, 4.0
     message.pose.pose.position.z = message.twist.twist.linear.z = 9.0
     data = serialize_message(message)
     assert standard_messages.odometry_in(data, world_frame) == (standard_messages.odometry(message, world_frame), child_frame)
 
 
+@pytest.mark.parametrize('world_frame, child_frame', [('map', 'robot_1/base_link'), ('m', ''), ('odom', 'abc')])
+def test_odometry_is_written_as_ros_serialises_it(world_frame, child_frame):
+    message = Odometry(child_frame_id=child_frame)
+    message.header.frame_id, message.header.stamp = world_frame, Time(sec=12, nanosec=250_000_000)
+    place, body, turn = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist
+    (place.x, place.y), (body.z, body.w) = POSE.position, (math.sin(0.25), math.cos(0.25))
+    turn.linear.x, turn.linear.y = turned(POSE.velocity, -POSE.heading)
+    turn.angular.z = 0.7
+    assert standard_messages.odometry_data(POSE, 0.7, world_frame, child_frame) == serialize_message(message)
+
+
 def test_bytes_that_are_no_odometry_are_refused():
-    message = convert_robots.odometry_message(Pose((1.5, -2.5), 0.5, (0.3, 0.4), 12.25), 0.7, 'map', 'base')
-    data, world_frame = serialize_message(message), 'map'
+    data, world_frame = standard_messages.odometry_data(POSE, 0.7, 'map', 'base'), 'map'
     for wrong in [data[:length] for length in range(len(data))] + [b'\0\0' + data[2:], data[:12] + b'\xff' * (len(data) - 12)]:
         with pytest.raises(Refused) as refused:
             standard_messages.odometry_in(wrong, world_frame)
