@@ -19,7 +19,7 @@ from dae_ros.replay.recording import FLUSH_PERIOD, Recording
 from dae_ros.ros.node import TeamNode, run
 from dae_ros.ros.recorded import RecordedTopic, as_written, team_topics
 
-NICENESS = 5  # the team comes first: what comes while it works is kept until the recorder's turn
+NICENESS = 10  # the team comes first: what comes while it works is kept until the recorder's turn
 
 
 class RecorderNode(TeamNode):
