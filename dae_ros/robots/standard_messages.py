@@ -24,6 +24,11 @@ def seconds(time: Any) -> float:
     return time.sec + time.nanosec / NANOSECONDS
 
 
+def second_and_nanosecond(time: float) -> tuple[int, int]:
+    """A time [s] as a builtin_interfaces/Time has it."""
+    return divmod(round(time * NANOSECONDS), NANOSECONDS)
+
+
 def odometry(message: Any, world_frame: str) -> Pose:
     """Pose in the world frame, which the nav_msgs/Odometry must be in. Its twist is in `child_frame_id`, the robot's body as a
     rule. Raises Refused."""
@@ -52,7 +57,7 @@ def odometry_in(data: bytes, world_frame: str) -> tuple[Pose, str]:
 
 def odometry_data(pose: Pose, turn: float, world_frame: str, body_frame: str) -> bytes:
     """A serialised nav_msgs/Odometry, with its twist in the body's frame and covariances of 0; `turn` in rad/s."""
-    data = bytearray(_LITTLE_ENDIAN + b'\x00\x00' + _TIME.pack(*divmod(round(pose.time * NANOSECONDS), NANOSECONDS)))
+    data = bytearray(_LITTLE_ENDIAN + b'\x00\x00' + _TIME.pack(*second_and_nanosecond(pose.time)))
     for text, alignment in ((world_frame, _LENGTH.size), (body_frame, 8)):
         characters = text.encode() + b'\x00'
         data += _LENGTH.pack(len(characters)) + characters

@@ -11,15 +11,15 @@ from geometry_msgs.msg import Pose as PoseMessage
 
 from dae_ros.robots.geometry import Pose, quaternion_of
 from dae_ros.robots.motion import Command
-from dae_ros.robots.standard_messages import NANOSECONDS
+from dae_ros.robots.standard_messages import second_and_nanosecond
 
 if TYPE_CHECKING:
     from dae_ros.learning.credit import Credit
 
 
 def time_message(time: float) -> Time:
-    whole, part = divmod(round(time * NANOSECONDS), NANOSECONDS)
-    return Time(sec=whole, nanosec=part)
+    second, nanosecond = second_and_nanosecond(time)
+    return Time(sec=second, nanosec=nanosecond)
 
 
 def transform_message(pose: Pose, world_frame: str, body_frame: str) -> TransformStamped:
