@@ -162,9 +162,10 @@ class Listener:
         """Takes messages in until `condition` holds, or does not for so long."""
         deadline = time.monotonic() + seconds
         while not condition():
-            if time.monotonic() >= deadline:
+            left = deadline - time.monotonic()
+            if left <= 0.0:
                 return False
-            self.executor.spin_once(timeout_sec=1.0)
+            self.executor.spin_once(timeout_sec=min(left, 1.0))
         return True
 
     def wait_for_status(self, condition: Callable[[TrainingStatus], bool]) -> TrainingStatus:

@@ -136,13 +136,18 @@ class Stage(Listener):
 
     def tick_until(self, condition: Callable[[], bool], *shown: int) -> None:
         """Lets the clock go on, ten times as fast as at most, until `condition` holds; AssertionError if it never does."""
+        self._repeat_until(condition, lambda: self.tick(*shown))
+
+    def show_until(self, condition: Callable[[], bool], robot: int, **changes) -> None:
+        """Shows the same odometry, of which some may get lost, until `condition` holds; AssertionError if it never does."""
+        self._repeat_until(condition, lambda: self.show(robot, **changes))
+
+    def _repeat_until(self, condition: Callable[[], bool], act: Callable[[], None]) -> None:
         deadline = time.monotonic() + TIMEOUT
         while not condition():
             assert time.monotonic() < deadline, dict(self.diagnostics)
-            self.tick(*shown)
-            pause = time.monotonic() + 0.1 * PERIOD
-            while not condition() and time.monotonic() < pause:
-                self.executor.spin_once(timeout_sec=0.1 * PERIOD)
+            act()
+            self._holds_within(0.1 * PERIOD, condition)
 
     def start_driving(self, robot: int, *shown: int) -> None:
         """Ticks until the robot drives."""
