@@ -93,12 +93,10 @@ class AgentNode(TeamNode):
 
     def _on_fetched(self, future) -> None:
         response, self._fetching = future.result(), None
-        try:
+        with self.refusing(names.GET_POLICY):
             if not response.success:
                 raise Refused(Refused.WRONG_VERSION, response.message)
             self._on_policy(response.policy)
-        except Refused as refusal:
-            self.refuse(names.GET_POLICY, refusal)
 
     def _on_status(self, message: msg.TrainingStatus) -> None:
         """An agent that joined the run it heard is free for the next one when that run is over."""

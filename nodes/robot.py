@@ -20,12 +20,13 @@ from dae_ros.ros.node import TeamNode, check_names, settings_of_process
 def make_robots() -> list[TeamNode]:
     """The nodes of the robots that the command line asks for, `agent_<robot>` and `bridge_<robot>`. Raises SettingsError."""
     asked = settings_of_process('robot', {info.name: info for info in (*OF_AGENT, *OF_BRIDGE)}.values())
-    nodes: list[TeamNode] = []
-    for robot in range(asked['robot'], asked['robot'] + asked['robots']):
-        agent = RobotAgentNode(names.agent_node(robot, 0, 1), beside_bridge=True, robot=robot, robots=1)
-        nodes += [agent, RobotBridgeNode(names.BRIDGE_NODE.format(robot), agent, robot=robot, robots=1)]
-    check_names(nodes, f'{len(nodes)} nodes')
-    return nodes
+    robots = range(asked['robot'], asked['robot'] + asked['robots'])
+    agents = [RobotAgentNode(names.agent_node(robot, 0, 1), beside_bridge=True, robot=robot, robots=1) for robot in robots]
+    bridges = [RobotBridgeNode(names.BRIDGE_NODE.format(robot), agent, robot=robot, robots=1)
+               for robot, agent in zip(robots, agents)]
+    check_names([*agents, *bridges], f'{len(agents) + len(bridges)} nodes')
+    bridges[0].listen_for(bridges)
+    return [*agents, *bridges]
 
 
 def main(args: list[str] | None = None) -> int:

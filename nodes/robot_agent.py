@@ -14,7 +14,6 @@ from dae_ros_msgs import msg
 from std_srvs.srv import Trigger
 
 from dae_ros.config import SETTINGS, AgentSettings, ExecutionSettings, RunBinding, TeamKey, declarations
-from dae_ros.errors import Refused
 from dae_ros.robots.acting import ActingEnd
 from dae_ros.ros import convert, names, qos
 from dae_ros.ros.node import TeamNode
@@ -31,7 +30,7 @@ class RobotAgentNode(TeamNode):
     """Wires an `ActingEnd` to its robot's topics."""
 
     def __init__(self, name: str = 'agent', beside_bridge: bool = False, **given: int):
-        """`beside_bridge`: the robot's bridge is in this process and calls `answer` itself."""
+        """`beside_bridge`: the robot's bridge is in this process and calls `answer` and `tell` itself."""
         super().__init__(name, DECLARED, **given)
         robot, path = self.settings['robot'], self.settings['policy_file']
         self._topic = names.OBSERVATION.format(robot)
@@ -46,23 +45,27 @@ class RobotAgentNode(TeamNode):
             self.listen(msg.PolicyWeights, names.POLICY, qos.LATCHED_INPUT, self._on_policy)
         self.create_service(Trigger, names.ACTIVATE_POLICY, self._on_activate)
         if not beside_bridge:
-            self.listen(msg.Observation, self._topic, qos.LATCHED_INPUT,
-                        lambda message: self._act(time.perf_counter(), convert.observation(message)))
+            self.listen(msg.Observation, self._topic, qos.LATCHED_INPUT, self._on_observation)
 
     def answer(self, observation: Observation) -> Action | None:
-        """The action, which all are told; None while there is no policy, and where the observation is refused and counted."""
-        try:
-            return self._act(time.perf_counter(), observation)
-        except Refused as refusal:
-            self.refuse(self._topic, refusal)
-            return None
-
-    def _act(self, began: float, observation: Observation) -> Action | None:
-        action = self._end.on_observation(observation)
+        """The action; None while there is no policy, and where the observation is refused and counted."""
+        began, action = time.perf_counter(), None
+        with self.refusing(self._topic):
+            action = self._end.on_observation(observation)
         if action is not None:
-            self._actions.publish(convert.action_message(action))
             self._taken.append(time.perf_counter() - began)
         return action
+
+    def tell(self, action: Action) -> None:
+        """Publishes what the robot does."""
+        self._actions.publish(convert.action_message(action))
+
+    def _on_observation(self, message: msg.Observation) -> None:
+        began = time.perf_counter()
+        action = self._end.on_observation(convert.observation(message))
+        if action is not None:
+            self.tell(action)
+            self._taken.append(time.perf_counter() - began)
 
     def _on_policy(self, message: msg.PolicyWeights) -> None:
         weights = convert.policy_weights(message)

@@ -38,9 +38,13 @@ class RobotBridgeNode(TeamNode):
     """Wires a `Pilot` to the topics of its robot and the team's odometry."""
 
     def __init__(self, name: str = 'robot_bridge', agent: RobotAgentNode | None = None, **given: int):
-        """`agent`: the robot's, where it is in this process; others are told what both say, but neither waits for the network."""
+        """`agent`: the robot's, where it is in this process: it is asked directly, and what both say is told when all robots of the
+        process know what to do. The bridge hears what somebody's `listen_for` lets it hear."""
         super().__init__(name, DECLARED, **given)
         self._agent = agent
+        self._bridges: list[RobotBridgeNode] = []  # that this one listens for
+        self._listener = self
+        self._untold: tuple[Observation, Action | None] | None = None
         settings = self.settings
         robot, self._world_frame, self._stamped = settings['robot'], settings['world_frame'], settings['stamped']
         self._body_frame = ''
@@ -48,16 +52,25 @@ class RobotBridgeNode(TeamNode):
         self._pilot = make_pilot(settings)
         self._commands = self.publisher(TwistStamped if self._stamped else Twist, names.COMMAND.format(robot), qos.NEWEST)
         self._observations = self.publisher(msg.Observation, names.OBSERVATION.format(robot), qos.LATCHED)
-        for other in range(settings['num_agents']):
-            self.listen(Odometry, names.ODOMETRY.format(other), qos.NOW, partial(self._on_odometry, other), raw=True)
         if settings['landmarks']:
             self._take_landmarks(settings['landmarks'])
-        else:
-            self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
         if agent is None:
             self.listen(msg.Action, names.ACTION.format(robot), qos.EVENTS, lambda message: self._obey(convert.action(message)))
         self.create_service(SetBool, names.ENABLE, self._on_enable)
-        self.as_time_goes_on(1.0 / (LOOKS * settings['control_rate']), self._look, qos.NOW)
+
+    def listen_for(self, bridges: list[RobotBridgeNode]) -> None:
+        """Hears the clock and what the team's robots show, for the bridges of one process; this one is among them."""
+        self._bridges = bridges
+        for bridge in bridges:
+            bridge._listener = self
+        for robot in range(self.settings['num_agents']):
+            self.listen(Odometry, names.ODOMETRY.format(robot), qos.NOW, partial(self._on_odometry, robot), raw=True)
+        if not self.settings['landmarks']:
+            self.listen(PoseArray, names.LANDMARKS, qos.LATCHED_INPUT, self._on_landmarks)
+        self.as_time_goes_on(1.0 / (LOOKS * self.settings['control_rate']), self._look_around, qos.NOW)
+
+    def now(self) -> float:
+        return super().now() if self._listener is self else self._listener.now()
 
     def end(self) -> None:
         """Tells the robot to stand, as the last thing said; from whichever thread ends the node."""
@@ -71,12 +84,17 @@ class RobotBridgeNode(TeamNode):
         if now == 0.0:  # simulated time has not begun
             return
         pose, body_frame = standard_messages.odometry_in(data, self._world_frame)
-        self._pilot.on_odometry(robot, pose, now)
-        if robot == self.settings['robot']:
-            self._body_frame = body_frame
+        for bridge in self._bridges:
+            with bridge.refusing(names.ODOMETRY.format(robot)):
+                bridge._pilot.on_odometry(robot, pose, now)
+                if robot == bridge.settings['robot']:
+                    bridge._body_frame = body_frame
 
     def _on_landmarks(self, message: PoseArray) -> None:
-        self._pilot.on_landmarks(standard_messages.landmarks(message, self._world_frame))
+        landmarks = standard_messages.landmarks(message, self._world_frame)
+        for bridge in self._bridges:
+            with bridge.refusing(names.LANDMARKS):
+                bridge._pilot.on_landmarks(landmarks)
 
     def _take_landmarks(self, text: str) -> None:
         try:
@@ -89,18 +107,24 @@ class RobotBridgeNode(TeamNode):
 
     def _ask(self, agent: RobotAgentNode, observation: Observation) -> None:
         action = agent.answer(observation)
-        try:
-            if action is not None:
+        self._untold = observation, action
+        if action is not None:
+            with self.refusing(names.ACTION.format(self.settings['robot'])):
                 self._obey(action)
-        except Refused as refusal:
-            self.refuse(names.ACTION.format(self.settings['robot']), refusal)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._pilot.enable(request.data)
         self._look()
+        self._tell()
         stop = self._pilot.stop
         response.success, response.message = True, 'driving' if stop is None else f'standing: {stop.detail}'
         return response
+
+    def _look_around(self) -> None:
+        for bridge in self._bridges:
+            bridge._look()
+        for bridge in self._bridges:
+            bridge._tell()
 
     def _look(self) -> None:
         before = self._pilot.stop
@@ -108,13 +132,21 @@ class RobotBridgeNode(TeamNode):
         if turn.command is not None:
             self._send(turn.command)
         if turn.observation is not None:
-            self._observations.publish(convert.observation_message(turn.observation))
-            if self._agent is not None:
+            if self._agent is None:
+                self._observations.publish(convert.observation_message(turn.observation))
+            else:
                 self._ask(self._agent, turn.observation)
         stop = self._pilot.stop
         if (stop and stop.reason) != (before and before.reason):
             self.get_logger().info('driving' if stop is None else f'standing: {stop.detail}')
             self.publish_diagnostics()
+
+    def _tell(self) -> None:
+        if self._untold is not None:
+            (observation, action), self._untold = self._untold, None
+            self._observations.publish(convert.observation_message(observation))
+            if action is not None:
+                self._agent.tell(action)
 
     def _send(self, command: Command) -> None:
         message = convert_robots.command_message(command, self._stamped, self.now(), self._body_frame)
@@ -157,8 +189,14 @@ def run_robots(make_nodes: Callable[[], list[TeamNode]], args: list[str] | None 
     return run_together(make, args)
 
 
+def make_bridge() -> list[TeamNode]:
+    bridge = RobotBridgeNode()
+    bridge.listen_for([bridge])
+    return [bridge]
+
+
 def main(args: list[str] | None = None) -> int:
-    return run_robots(lambda: [RobotBridgeNode()], args)
+    return run_robots(make_bridge, args)
 
 
 if __name__ == '__main__':

@@ -5,7 +5,8 @@ from __future__ import annotations
 import gc
 import signal
 from collections import Counter
-from typing import Any, Callable, Iterable
+from contextlib import contextmanager
+from typing import Any, Callable, Iterable, Iterator
 
 import rclpy
 from dae_ros_msgs.msg import TrainingStatus
@@ -90,10 +91,8 @@ class TeamNode(Node):
                raw: bool = False) -> Subscription:
         """A subscription; a message that `handle` refuses is counted and otherwise ignored. `raw`: as bytes, not decoded."""
         def receive(message) -> None:
-            try:
+            with self.refusing(topic):
                 handle(message)
-            except Refused as refusal:
-                self.refuse(topic, refusal)
 
         def match(change) -> None:
             if change.total_count_change > 0:
@@ -153,6 +152,14 @@ class TeamNode(Node):
         self._refusals[topic, refusal.reason] += 1
         if self._refusals[topic, refusal.reason] == 1:
             self.get_logger().warning(f'refused a message on {topic}: {refusal} (further ones are only counted)')
+
+    @contextmanager
+    def refusing(self, topic: str) -> Iterator[None]:
+        """What is refused within is counted for this topic and otherwise ignored."""
+        try:
+            yield
+        except Refused as refusal:
+            self.refuse(topic, refusal)
 
     def on_matched(self) -> None:
         """An endpoint found or lost a partner."""

@@ -31,6 +31,7 @@ from tests.bags import write_bag
 SHIPPED = REPOSITORY / 'config' / 'sros2' / 'team.policy.xml'
 NAMESPACE = 'red'
 SIZE = {**SMALL, 'num_agents': 2, 'total_steps': 10**7}
+APART = {'robots_per_process': 1}  # as where security is switched on: those of a process share what they hear
 FINDERS = {'publish': 'publisher', 'subscribe': 'subscriber', 'reply': 'service', 'request': 'client'}
 
 
@@ -92,9 +93,9 @@ def test_policies_of_a_team_that_cannot_be_are_refused(arguments, sentence, monk
 
 @pytest.mark.parametrize('team, values, arguments, by_hand', [
     (Team(2, world_groups=2, watch=True), {'world_groups': 2}, ['--watch', '0'], ['recorder']),
-    (Team(2, stream=True, simulate=True, real_time_factor=2.0), {'real_time_factor': 2.0, 'evaluation_greedy': False},
+    (Team(2, stream=True, simulate=True, real_time_factor=2.0), {'real_time_factor': 2.0, 'evaluation_greedy': False, **APART},
      ['--stream', '--simulate'], ['recorder', 'credit']),
-    (Team(2, execute='navigation', simulate=True), {'enabled': False}, ['--execute', 'navigation', '--simulate'],
+    (Team(2, execute='navigation', simulate=True), {'enabled': False, **APART}, ['--execute', 'navigation', '--simulate'],
      ['task_monitor', 'credit']),
     (Team(2, world_groups=2, watch=True, replay=True), {}, [], ['player', 'replay_trainer']),
 ], ids=['training', 'stream', 'execution', 'replay'])

@@ -119,6 +119,39 @@ def test_odometry_that_cannot_be_right_stops_the_robot_and_so_do_a_dead_agent_an
         assert 'Traceback' not in processes.log('bridge_1')
 
 
+def test_robots_of_one_process_are_driven_and_stopped_each_by_itself(stage, processes):
+    """One of their bridges listens for all of them; what an agent is asked and says is told afterwards."""
+    settings = {'robots': 3, 'policy_file': POLICY, 'enabled': 'true', **SIMULATED}
+    processes.python('robots', 'dae_ros_nodes.robot', '--ros-args',
+                     *(text for name, value in settings.items() for text in ('-p', f'{name}:={value}')))
+    stage.wait_for_bridges(1)
+    everybody = 0, 1, 2
+    for robot in everybody:
+        stage.start_driving(robot, *everybody)
+    for _ in range(EPISODE):
+        stage.step(everybody, *everybody)
+    policy = decode_policy(POLICY.read_bytes())
+    for robot in everybody:
+        stage.spin_until(lambda: stage.observations[robot][-1].stamp == stage.actions[robot][-1].stamp)
+        acted, seen = (stage.decoded(heard[robot])[-EPISODE:] for heard in (stage.actions, stage.observations))
+        assert [action.stamp for action in acted] == [observation.stamp for observation in seen]
+        episode = next(index for index, observation in enumerate(seen) if observation.stamp.step == 0)
+        assert [action.actions[0] for action in acted[episode:]] == answers_of(policy, seen[episode:])
+
+    assert stage.call(SetBool, 'bridge_2/enable', SetBool.Request(data=False)).message == 'standing: not enabled'
+    stage.spin_until(lambda: is_standing(stage.commands[2][-1]))
+    for robot in 0, 1:
+        stage.start_driving(robot, *everybody)
+    assert is_standing(stage.commands[2][-1])
+    stage.wait_for_words('bridge_0', 'its own odometry is', 1, 2)
+    stage.wait_for_words('bridge_1', 'the odometry of robot 0 is', 1, 2)
+    stage.tick(1, 2)
+    stage.show_until(lambda: '[bridge_1]: refused a message on robot_0/odom: jump: ' in processes.log('robots'), 0, position=(9.0, 9.0))
+    assert processes.end('robots') == 0
+    stage.spin_until(lambda: all(is_standing(stage.commands[robot][-1]) for robot in everybody))
+    assert 'Traceback' not in processes.log('robots')
+
+
 def test_what_robots_do_does_not_change_when_trainer_and_parameter_server_are_killed(stage, processes, make_graph, tmp_path):
     graph = make_graph(tmp_path / 'graph', SMALL)
     graph.start('trainer', 'parameter_server')
