@@ -16,13 +16,14 @@ from dae_ros.command import hurried, uninterrupted
 
 GRACE = 8.0  # s from the request to stop until a process is killed
 GLANCE = 0.1  # s between looks at whether it is to hurry
+LAST_WORDS = 1.0  # s for a process that hangs to tell its log where
 _PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None)
+_prctl = ctypes.CDLL(None).prctl  # found here: to look for it in the child may take a lock that was another thread's at the fork
 
 
 def _end_with_parent() -> None:
     """In the child, before it becomes the node: have the kernel end it should the supervisor be killed."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    _prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def catches(pid: int, number: int) -> bool:
@@ -49,17 +50,21 @@ class Supervisor:
     def start(self, name: str, command: list[str], environment: Mapping[str, str]) -> int:
         """Starts a process in a session of its own: Ctrl-C in the terminal reaches the supervisor alone. Its process id."""
         with uninterrupted(), open(self.log_file(name), 'ab') as log:  # or nobody would know of the process
-            process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                                       start_new_session=True, preexec_fn=_end_with_parent)
+            process = subprocess.Popen(command, env={**environment, 'PYTHONFAULTHANDLER': '1'}, stdin=subprocess.DEVNULL,
+                                       stdout=log, stderr=log, start_new_session=True, preexec_fn=_end_with_parent)
             self._processes[name] = process
         threading.Thread(target=self._watch, args=(name, process), daemon=True).start()
         return process.pid
 
     def kill(self, name: str) -> None:
-        """Ends a process that would not end by itself."""
+        """Ends a process that hangs, and whatever it started; its log shows where each of its threads was if it can still be asked."""
         process = self._processes[name]
         if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
+            os.kill(process.pid, signal.SIGABRT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(LAST_WORDS)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
     def log_file(self, name: str) -> Path:
         """Where the process's output goes."""
