@@ -57,7 +57,7 @@ class Supervisor:
         return process.pid
 
     def kill(self, name: str) -> None:
-        """Ends a process that hangs, and whatever it started. Its log shows where each of its threads was, unless it is stopped."""
+        """Ends a process that hangs, and whatever it started; its log shows where it was, unless it is stopped."""
         process = self._processes[name]
         if process.poll() is None:
             os.kill(process.pid, signal.SIGABRT)
