@@ -21,8 +21,10 @@ def make_robots() -> list[TeamNode]:
     """The nodes of the robots that the command line asks for, `agent_<robot>` and `bridge_<robot>`. Raises SettingsError."""
     asked = settings_of_process('robot', {info.name: info for info in (*OF_AGENT, *OF_BRIDGE)}.values())
     robots = range(asked['robot'], asked['robot'] + asked['robots'])
-    agents = [RobotAgentNode(names.agent_node(robot, 0, 1), beside_bridge=True, robot=robot, robots=1) for robot in robots]
-    bridges = [RobotBridgeNode(names.BRIDGE_NODE.format(robot), agent, robot=robot, robots=1)
+    agents: list[RobotAgentNode] = []
+    for robot in robots:
+        agents.append(RobotAgentNode(names.agent_node(robot, 0, 1), True, agents[0] if agents else None, robot=robot, robots=1))
+    bridges = [RobotBridgeNode(names.BRIDGE_NODE.format(robot), agent, agents[0], robot=robot, robots=1)
                for robot, agent in zip(robots, agents)]
     check_names([*agents, *bridges], f'{len(agents) + len(bridges)} nodes')
     bridges[0].listen_for(bridges)

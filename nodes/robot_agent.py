@@ -29,9 +29,9 @@ REMEMBERED = 1000  # answers whose times are shown
 class RobotAgentNode(TeamNode):
     """Wires an `ActingEnd` to its robot's topics."""
 
-    def __init__(self, name: str = 'agent', beside_bridge: bool = False, **given: int):
+    def __init__(self, name: str = 'agent', beside_bridge: bool = False, clock_of: TeamNode | None = None, **given: int):
         """`beside_bridge`: the robot's bridge is in this process and calls `answer` and `tell` itself."""
-        super().__init__(name, DECLARED, **given)
+        super().__init__(name, DECLARED, clock_of, **given)
         robot, path = self.settings['robot'], self.settings['policy_file']
         self._topic = names.OBSERVATION.format(robot)
         self._end = ActingEnd(robot, self.settings['greedy'], self.settings['seed'], self.settings['run'])

@@ -37,10 +37,11 @@ LAST_WORD = Duration(seconds=0.5)  # for the last command to arrive
 class RobotBridgeNode(TeamNode):
     """Wires a `Pilot` to the topics of its robot and the team's odometry."""
 
-    def __init__(self, name: str = 'robot_bridge', agent: RobotAgentNode | None = None, **given: int):
+    def __init__(self, name: str = 'robot_bridge', agent: RobotAgentNode | None = None, clock_of: TeamNode | None = None,
+                 **given: int):
         """Hears nothing before a bridge of this process `listen_for`s it. `agent`: the robot's, where it is in this process; it
         is asked directly, and the network is told what both say when all robots of the process know what to do."""
-        super().__init__(name, DECLARED, **given)
+        super().__init__(name, DECLARED, clock_of, **given)
         self._agent = agent
         self._bridges: list[RobotBridgeNode] = []  # that this one listens for
         self._listener = self

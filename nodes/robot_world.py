@@ -42,8 +42,8 @@ class RobotWorldNode(TeamNode):
         self._bodies = Bodies(task, self._frame, limits_in(settings), settings['drive'] == 'differential', settings['seed'])
         self._episode, self._period = 0, 1.0 / settings['odometry_rate']
         self._is_clock = settings['real_time_factor'] != 1.0
-        self._time, self._overdue = BEGINNING, False
-        self._pace = Pace(self._bodies, self._period, 1.0 / settings['control_rate'])
+        self._time = BEGINNING
+        self._pace = Pace(self._bodies, self._period, 1.0 / settings['control_rate'], settings['real_time_factor'])
         command = TwistStamped if settings['stamped'] else Twist
         self._odometry = [self.publisher(Odometry, names.ODOMETRY.format(i), qos.NEWEST) for i in robots]
         self._landmarks = self.publisher(PoseArray, names.LANDMARKS, qos.LATCHED)
@@ -62,8 +62,7 @@ class RobotWorldNode(TeamNode):
 
     def _on_command(self, robot: int, message: Twist | TwistStamped) -> None:
         self._bodies.obey(robot, standard_messages.command(message), self.now())
-        if self._overdue:
-            self._overdue = False
+        if self._is_clock:  # which may have waited for this robot
             self._tick()
 
     def _on_next_episode(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -80,8 +79,7 @@ class RobotWorldNode(TeamNode):
         self._landmarks.publish(convert_robots.landmarks_message(self._bodies.landmarks, self.now(), self._world_frame))
 
     def _tick(self) -> None:
-        if self._is_clock and self._pace.must_wait(self._time, time.monotonic()):
-            self._overdue = True
+        if self._is_clock and not self._pace.goes_on(self._time, time.monotonic()):
             return
         self._time = round(self._time + self._period, 6)
         now = self.now()

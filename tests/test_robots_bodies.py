@@ -76,22 +76,33 @@ def test_robots_that_meet_push_each_other_and_stay_apart():
 
 def test_a_simulated_clock_waits_at_the_end_of_a_period_for_who_is_driven_and_was_not_told_anything_in_it():
     one = bodies(robots=2)
-    pace = Pace(one, tick=0.05, control_period=0.1)
-    assert not pace.must_wait(1.05, 0.0)     # nobody is driven yet
+    pace = Pace(one, tick=0.05, control_period=0.1, factor=math.inf)
+    assert pace.goes_on(1.05, 0.0)           # nobody is driven yet
     one.obey(0, Command(0.1, 0.0, 0.0), now=1.0)
-    assert not pace.must_wait(1.05, 0.0)     # told in this period
-    assert not pace.must_wait(1.10, 0.0)     # the next one goes on for another tick
-    assert pace.must_wait(1.15, 0.0) and pace.must_wait(1.15, 0.9 * PATIENCE)
+    assert pace.goes_on(1.05, 0.0)           # told in this period
+    assert pace.goes_on(1.10, 0.0)           # the next one goes on for another tick
+    assert not pace.goes_on(1.15, 0.0) and not pace.goes_on(1.15, 0.9 * PATIENCE)
     one.obey(0, Command(0.1, 0.0, 0.0), now=1.15)
-    assert not pace.must_wait(1.15, 0.95 * PATIENCE)
-    assert pace.must_wait(1.25, 3.0) and not pace.must_wait(1.25, 3.0 + PATIENCE)  # whom nobody drives any more
-    assert not pace.must_wait(1.85, 4.0)
+    assert pace.goes_on(1.15, 0.95 * PATIENCE)
+    assert not pace.goes_on(1.25, 3.0) and pace.goes_on(1.25, 3.0 + PATIENCE)  # whom nobody drives any more
+    assert pace.goes_on(1.85, 4.0)
 
 
 def test_a_clock_that_ticks_once_a_period_waits_each_time_and_a_new_episode_changes_nothing_about_it():
     one = bodies(robots=1)
-    pace = Pace(one, tick=0.1, control_period=0.1)
+    pace = Pace(one, tick=0.1, control_period=0.1, factor=math.inf)
     one.obey(0, Command(0.1, 0.0, 0.0), now=2.4)
-    assert not pace.must_wait(2.4, 0.0) and pace.must_wait(2.5, 0.0)
+    assert pace.goes_on(2.4, 0.0) and not pace.goes_on(2.5, 0.0)
     one.place(1)
-    assert pace.must_wait(2.5, 0.01)
+    assert not pace.goes_on(2.5, 0.01)
+
+
+def test_a_clock_that_lost_time_makes_up_for_a_second_of_it_at_most_and_is_never_ahead():
+    pace = Pace(bodies(), tick=0.1, control_period=0.1, factor=4.0)
+
+    def moments(*when):
+        return [pace.goes_on(1.0, real) for real in when]
+
+    assert moments(7.0, 7.0, 7.01, 7.024, 7.03) == [True, False, False, True, False]  # each 25 ms, give or take a timer's jitter
+    assert moments(*[7.2] * 10) == [True] * 7 + [False] * 3                           # it stood still for 150 ms and more
+    assert sum(moments(*[90.0] * 100)) == 41                                          # for a minute, of which a second counts

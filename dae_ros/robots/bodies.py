@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import numpy as np
 
 from dae_ros.config import TaskSettings
-from dae_ros.robots.geometry import Pose, TaskFrame, wrapped
+from dae_ros.robots.geometry import Pose, TaskFrame, turned, wrapped
 from dae_ros.robots.motion import STOP, Command, Limits
 from dae_ros.robots.task_monitor import one_team
 
@@ -24,7 +25,6 @@ class Bodies:
         self.num_robots = task.num_agents
         self.episode_steps = worlds.episode_steps
         self.radius = worlds.radius * frame.scale
-        self._first, self._second = np.triu_indices(self.num_robots, k=1)
         self._heard = [-math.inf] * self.num_robots
         self.place(0)
 
@@ -59,14 +59,12 @@ class Bodies:
 
     def move(self, now: float, duration: float) -> None:
         """Moves everybody for `duration` as told; whoever was told nothing for long stands."""
-        told = np.array([command if now - heard <= COMMAND_TIMEOUT else STOP
-                         for command, heard in zip(self._commands, self._heard)])
-        self.turns = told[:, 2]
-        self.headings = np.array([wrapped(heading) for heading in self.headings + duration * self.turns])
-        cosines, sines = np.cos(self.headings), np.sin(self.headings)
+        told = [command if now - heard <= COMMAND_TIMEOUT else STOP for command, heard in zip(self._commands, self._heard)]
+        headings = [wrapped(heading + duration * command.turn) for heading, command in zip(self.headings.tolist(), told)]
+        wanted = [turned((command.forward, command.left), heading) for command, heading in zip(told, headings)]
         before = self.positions
-        wanted = np.stack([cosines * told[:, 0] - sines * told[:, 1], sines * told[:, 0] + cosines * told[:, 1]], axis=1)
-        self.positions = self._apart(before + duration * wanted)
+        self.headings, self.turns = np.array(headings), np.array([command.turn for command in told])
+        self.positions = self._apart(before + duration * np.array(wanted))
         self.velocities = (self.positions - before) / duration
 
     def pose(self, robot: int, now: float) -> Pose:
@@ -75,10 +73,12 @@ class Bodies:
 
     def _apart(self, positions: np.ndarray) -> np.ndarray:
         """`positions` [N, 2] with discs that overlap pushed apart, each by half."""
-        separation = positions[self._first] - positions[self._second]
-        distance = np.maximum(np.linalg.norm(separation, axis=1), 1e-9)
-        push = separation * (np.maximum(2.0 * self.radius - distance, 0.0) / (2.0 * distance))[:, None]
-        positions = positions.copy()
-        np.add.at(positions, self._first, push)
-        np.subtract.at(positions, self._second, push)
-        return positions
+        apart = positions.copy()
+        for (first, one), (second, other) in combinations(enumerate(positions.tolist()), 2):
+            separation = one[0] - other[0], one[1] - other[1]
+            distance = max(math.hypot(*separation), 1e-9)
+            if distance < 2.0 * self.radius:
+                push = (self.radius / distance - 0.5) * np.array(separation)
+                apart[first] += push
+                apart[second] -= push
+        return apart

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import Any
 
@@ -90,7 +91,7 @@ def command(message: Any) -> Command:
     """What a geometry_msgs/Twist or TwistStamped tells a robot. Raises Refused where it is not finite."""
     twist = getattr(message, 'twist', message)
     found = Command(twist.linear.x, twist.linear.y, twist.angular.z)
-    if not np.isfinite(found).all():
+    if not all(map(math.isfinite, found)):
         raise Refused(Refused.NOT_FINITE, 'a velocity is not finite')
     return found
 

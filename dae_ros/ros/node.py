@@ -23,6 +23,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
+from rclpy.time_source import TimeSource
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
@@ -68,8 +69,11 @@ class TeamNode(Node):
     whenever an endpoint of theirs found or lost a partner, `on_new_source` and `diagnose`.
     """
 
-    def __init__(self, name: str, declared: Iterable[SettingInfo], **given: Any):
-        """`given` are settings that hold whatever the command line says."""
+    def __init__(self, name: str, declared: Iterable[SettingInfo], clock_of: TeamNode | None = None, **given: Any):
+        """`clock_of`: a node of this process that hears simulated time for this one too. `given` are settings that hold whatever
+        the command line says."""
+        self._clock_of = clock_of or self
+        self._clock_hearers: list[Callable[[ClockMessage], None]] = []
         super().__init__(name, automatically_declare_parameters_from_overrides=True,
                          parameter_overrides=[Parameter(key, value=value) for key, value in given.items()])
         self.settings: dict[str, Any] = params.declare(self, declared)
@@ -124,6 +128,22 @@ class TeamNode(Node):
         if self.get_parameter('use_sim_time').value:
             self._moment = 0.0
             self.listen(ClockMessage, names.CLOCK, profile, on_clock)
+
+    def create_subscription(self, msg_type: type, topic: str, callback: Callable, *arguments, **options) -> Subscription:
+        """A subscription. rclpy makes one of simulated time for each node; `clock_of` has one for several."""
+        if not isinstance(getattr(callback, '__self__', None), TimeSource):
+            return super().create_subscription(msg_type, topic, callback, *arguments, **options)
+        hearers = self._clock_of._clock_hearers
+        hearers.append(callback)
+        if self is not self._clock_of:
+            return self._clock_of._clock_subscription
+
+        def hear(message: ClockMessage) -> None:
+            for hearer in hearers:
+                hearer(message)
+
+        self._clock_subscription = super().create_subscription(msg_type, topic, hear, *arguments, **options)
+        return self._clock_subscription
 
     def create_service(self, srv_type: type, srv_name: str, callback: Callable, **options) -> Service:
         """A service. Those with which rclpy lets anyone change parameters refuse: it would fall over a value of an unknown type,

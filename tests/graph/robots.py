@@ -100,7 +100,8 @@ class Stage(Listener):
         self.landmarks.publish(convert_robots.landmarks_message(landmarks, self.now, FRAME))
         self.spin_until(lambda: all(publisher.get_subscription_count() >= number for publisher in self.odometry))
         self.spin_until(lambda: self.clock.get_subscription_count() >= number)
-        self.spin_until(lambda: sum(self.node.count_publishers(names.COMMAND.format(robot)) for robot in self.robots) >= number)
+        for topic in names.COMMAND, names.OBSERVATION, names.ACTION:
+            self.spin_until(lambda: sum(self.node.count_publishers(topic.format(robot)) for robot in self.robots) >= number)
 
     def show(self, robot: int, **changes) -> None:
         """Publishes the odometry of one robot, with fields of its pose changed."""
