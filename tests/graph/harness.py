@@ -15,7 +15,6 @@ from typing import Callable
 import rclpy
 from dae_ros_msgs.msg import TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import Trigger
 
 from dae_ros import config
@@ -25,6 +24,7 @@ from dae_ros.report.summary import Summary
 from dae_ros.rollout.in_process import train
 from dae_ros.ros import names, qos
 from dae_ros.ros.graph import NodeProcess, training_graph
+from dae_ros.ros.node import Executor
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
@@ -143,7 +143,7 @@ class Listener:
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
         self.node = rclpy.create_node('listener', context=self.context, namespace=namespace)
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = Executor(context=self.context)
         self.executor.add_node(self.node)
 
     def __enter__(self) -> Listener:
