@@ -147,7 +147,7 @@ def test_robots_of_one_process_are_driven_and_stopped_each_by_itself(stage, proc
     stage.wait_for_words('bridge_1', 'the odometry of robot 0 is', 1, 2)
     stage.tick(1, 2)
     refusal = '[bridge_1]: refused a message on robot_0/odom: jump: '
-    stage.show_until(lambda: refusal in processes.log('robots'), 0, position=(9.0, 9.0))
+    stage.show_until(lambda: refusal in processes.log('robots'), 0, position=(900.0, 900.0))
     assert processes.end('robots') == 0
     stage.spin_until(lambda: all(is_standing(stage.commands[robot][-1]) for robot in everybody))
     assert 'Traceback' not in processes.log('robots')
