@@ -85,8 +85,9 @@ class RobotBridgeNode(TeamNode):
         if now == 0.0:  # simulated time has not begun
             return
         pose, body_frame = standard_messages.odometry_in(data, self._world_frame)
+        topic = names.ODOMETRY.format(robot)
         for bridge in self._bridges:
-            with bridge.refusing(names.ODOMETRY.format(robot)):
+            with bridge.refusing(topic):
                 bridge._pilot.on_odometry(robot, pose, now)
                 if robot == bridge.settings['robot']:
                     bridge._body_frame = body_frame

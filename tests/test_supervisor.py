@@ -25,16 +25,20 @@ task_of_a_user()
 """
 
 
+def wait_until(condition):
+    deadline = time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 @pytest.fixture
 def hanging(tmp_path):
     """A process, with a child, that does nothing but run in a circle: supervisor, exits, process id."""
     exits: queue.Queue = queue.Queue()
     supervisor = Supervisor(tmp_path, lambda name, code: exits.put((name, code)))
     pid = supervisor.start('world', [sys.executable, '-c', ENDLESS], os.environ)
-    deadline = time.monotonic() + TIMEOUT
-    while 'begun' not in supervisor.log_file('world').read_text():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: 'begun' in supervisor.log_file('world').read_text())
     yield supervisor, exits, pid
     supervisor.stop()
 
@@ -55,7 +59,4 @@ def test_a_process_that_hangs_tells_where_and_is_gone_with_its_children(hanging,
     supervisor.kill('world')
     assert exits.get(timeout=TIMEOUT) == ('world', -end)
     assert ('in task_of_a_user' in supervisor.log_file('world').read_text()) != stopped
-    deadline = time.monotonic() + TIMEOUT
-    while is_there(pid):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: not is_there(pid))
