@@ -169,12 +169,19 @@ class Listener:
         return True
 
     def wait_for_status(self, condition: Callable[[TrainingStatus], bool]) -> TrainingStatus:
-        """The first status that fulfils `condition`."""
+        """The first status that fulfils `condition`.
+
+        Listens anew now and then: rmw keeps to itself what arrives while a new subscription is given its callback, until the next
+        message comes; and the last status may have none after it.
+        """
         heard: list[TrainingStatus] = []
-        subscription = self.node.create_subscription(TrainingStatus, names.TRAINING_STATUS, heard.append, qos.LATCHED_INPUT)
-        self.spin_until(lambda: any(condition(status) for status in heard))
-        self.node.destroy_subscription(subscription)
-        return next(status for status in heard if condition(status))
+        for _ in range(TIMEOUT // ANSWER_TIMEOUT):
+            subscription = self.node.create_subscription(TrainingStatus, names.TRAINING_STATUS, heard.append, qos.LATCHED_INPUT)
+            found = self._holds_within(ANSWER_TIMEOUT, lambda: any(condition(status) for status in heard))
+            self.node.destroy_subscription(subscription)
+            if found:
+                return next(status for status in heard if condition(status))
+        raise AssertionError(f'waited in vain; heard {heard}')
 
     def call(self, kind: type, name: str, request):
         """The response of a service, which must bear being asked twice.
