@@ -20,7 +20,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.time_source import TimeSource
@@ -40,6 +40,7 @@ except ImportError:  # an older Jazzy: its executor builds a wait set of everyth
     from rclpy.executors import SingleThreadedExecutor as Executor
 
 DIAGNOSTICS_PERIOD = 1.0  # s
+OVERLOOKED_PERIOD = 1.0  # s between looks for latched messages that were not announced
 FAREWELL = Duration(seconds=2)  # to let a node's last words reach who listens
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 LONG = 3600.0  # s; without a limit this executor does not wait but spins
@@ -85,6 +86,7 @@ class TeamNode(Node):
         self._refusals: Counter[tuple[str, str]] = Counter()
         self._diagnostics = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.EVENTS)
         self.every(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
+        take_overlooked(self)
 
     def publisher(self, kind: type, topic: str, profile: QoSProfile) -> Publisher:
         """A publisher whose partners coming and going call `on_matched`."""
@@ -216,6 +218,23 @@ class TeamNode(Node):
 def is_over(training: TrainingStatus) -> bool:
     """Whether it has ended, well or not: nodes that joined it and are not bound to its run are free for another."""
     return training.state in (TrainingStatus.FINISHED, TrainingStatus.FAILED)
+
+
+def take_overlooked(node: Node) -> Timer:
+    """Hands latched messages that lie unread to their callbacks, one of each topic each `OVERLOOKED_PERIOD`.
+
+    rmw_fastrtps counts what a new subscription has unread and only then listens for more. What comes between is announced with
+    the next message, but a latched one may have none after it: a robot's policy, the landmarks, a trainer that pauses.
+    """
+    def take() -> None:
+        for subscription in node.subscriptions:
+            if subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+                with subscription.handle:
+                    taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is not None:
+                    subscription.callback(taken[0])
+
+    return node.create_timer(OVERLOOKED_PERIOD, take, clock=STEADY)
 
 
 def set_timers_anew(nodes: Iterable[Node]) -> None:

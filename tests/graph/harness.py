@@ -12,19 +12,21 @@ from functools import partial
 from pathlib import Path
 from typing import Callable
 
+import pytest
 import rclpy
 from dae_ros_msgs.msg import TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import Trigger
 
 from dae_ros import config
+from dae_ros.learning.native import build
 from dae_ros.learning.networks import make_reward_network
 from dae_ros.learning.reward_files import encode
 from dae_ros.report.summary import Summary
 from dae_ros.rollout.in_process import train
 from dae_ros.ros import names, qos
 from dae_ros.ros.graph import NodeProcess, training_graph
-from dae_ros.ros.node import Executor
+from dae_ros.ros.node import Executor, take_overlooked
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
@@ -112,6 +114,17 @@ def oracle(folder: Path, values: dict) -> tuple[str, float]:
     return training.weights_sha256(), float(training.evaluation.mean())
 
 
+def preloadable(source: str, folder: Path) -> Path:
+    """The library of a C file of this folder; the test is skipped where there is no compiler."""
+    path, library = Path(__file__).with_name(source), (folder / source).with_suffix('.so')
+    try:
+        subprocess.run([*build.compiler(), '-O2', '-shared', '-fPIC', str(path), '-o', str(library), '-ldl'], check=True,
+                       timeout=TIMEOUT)
+    except build.BuildError as error:
+        pytest.skip(str(error))
+    return library
+
+
 def processes_naming(text: str) -> list[str]:
     """Command lines of the live processes that mention `text`."""
     lines = []
@@ -143,6 +156,7 @@ class Listener:
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
         self.node = rclpy.create_node('listener', context=self.context, namespace=namespace)
+        take_overlooked(self.node)
         self.executor = Executor(context=self.context)
         self.executor.add_node(self.node)
 
@@ -169,19 +183,12 @@ class Listener:
         return True
 
     def wait_for_status(self, condition: Callable[[TrainingStatus], bool]) -> TrainingStatus:
-        """The first status that fulfils `condition`.
-
-        Listens anew now and then: rmw keeps to itself what arrives while a new subscription is given its callback, until the next
-        message comes; and the last status may have none after it.
-        """
+        """The first status that fulfils `condition`."""
         heard: list[TrainingStatus] = []
-        for _ in range(TIMEOUT // ANSWER_TIMEOUT):
-            subscription = self.node.create_subscription(TrainingStatus, names.TRAINING_STATUS, heard.append, qos.LATCHED_INPUT)
-            found = self._holds_within(ANSWER_TIMEOUT, lambda: any(condition(status) for status in heard))
-            self.node.destroy_subscription(subscription)
-            if found:
-                return next(status for status in heard if condition(status))
-        raise AssertionError(f'waited in vain; heard {heard}')
+        subscription = self.node.create_subscription(TrainingStatus, names.TRAINING_STATUS, heard.append, qos.LATCHED_INPUT)
+        self.spin_until(lambda: any(condition(status) for status in heard), lambda: f'waited in vain; heard {heard}')
+        self.node.destroy_subscription(subscription)
+        return next(status for status in heard if condition(status))
 
     def call(self, kind: type, name: str, request):
         """The response of a service, which must bear being asked twice.

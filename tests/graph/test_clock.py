@@ -6,17 +6,15 @@ import os
 import re
 import signal
 import struct
-import subprocess
 import time
 from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import REPOSITORY, SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of
+from harness import REPOSITORY, SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of, preloadable
 from test_parameters import start
 
 from dae_ros import config
-from dae_ros.learning.native import build
 from dae_ros.report.summary import Summary
 from dae_ros.ros import names, qos
 from dae_ros.ros.graph import training_graph
@@ -65,13 +63,7 @@ class HostClock:
 
 @pytest.fixture
 def host_clock(tmp_path, monkeypatch):
-    library = tmp_path / 'clock_jump.so'
-    try:
-        subprocess.run([*build.compiler(), '-O2', '-shared', '-fPIC', str(Path(__file__).with_name('clock_jump.c')), '-o',
-                        str(library), '-ldl'], check=True, timeout=TIMEOUT)
-    except build.BuildError as error:
-        pytest.skip(str(error))
-    return HostClock(library, tmp_path / 'offset', monkeypatch)
+    return HostClock(preloadable('clock_jump.c', tmp_path), tmp_path / 'offset', monkeypatch)
 
 
 VALUES = {**SMALL, 'total_steps': 80 * 8 * 25, 'rollout_timeout': 60.0}
