@@ -62,8 +62,10 @@ class Curves:
         return [len(self.seeds[team, curve]) for team in teams]
 
     def averaged(self, task: str) -> list[Team]:
-        """The team sizes that every curve has; a mean over other ones would compare curves of different tasks."""
-        return [team for team in self.figure.sizes(task) if all(self.seeds[team, curve] for curve in self.figure.curves)]
+        """The team sizes that every curve trained so far has; a mean over other ones would compare curves of different tasks."""
+        sizes = self.figure.sizes(task)
+        trained = [curve for curve in self.figure.curves if any(self.seeds[team, curve] for team in sizes)]
+        return [team for team in sizes if trained and all(self.seeds[team, curve] for curve in trained)]
 
     def band(self, teams: list[Team], curve: str, metric: str) -> Band | None:
         """Mean over the teams' seeds and then over the teams; None if a team has no finished run."""

@@ -22,20 +22,22 @@ from reproduce.statistics import last
 
 YARDSTICKS = ('random', 'greedy', 'best')
 YARDSTICK_EPISODES = 1000
+POSSIBLE = {'win_rate': (0.0, 1.0), 'advantage/deviation': (0.0, np.inf)}
+"""Least and largest value; Student's t knows of none."""
 
 
 def draw(curves: Curves, path: Path) -> None:
-    """Writes the figure as a PNG, as far as its runs are finished."""
+    """Writes the figure as a PNG, as far as its runs are finished; a task that none of them is of has no panels."""
     figure = curves.figure
-    rows = [[curves.averaged(task) for task in figure.tasks]] if figure.average else [
-        [[team] for team in figure.sizes(task)] for task in figure.tasks]
-    columns = max(map(len, rows))
+    rows = {task: [curves.averaged(task)] if figure.average else [[team] for team in figure.sizes(task)] for task in figure.tasks}
+    rows = {task: row for task, row in rows.items() if any(_counts(curves, teams) for teams in row)} or rows
+    columns = max(map(len, rows.values()))
     wide = columns == 1
     canvas = Canvas(figsize=(7.5 if wide else 3.4 * columns, (4.2 if wide else 2.6) * len(rows) + 0.8), layout='constrained')
     FigureCanvasAgg(canvas)
     panels = canvas.subplots(len(rows), columns, squeeze=False)
-    for number, (row, places) in enumerate(zip(rows, panels)):
-        for teams, axes, task in zip(row, places, figure.tasks if figure.average else [figure.tasks[number]] * columns):
+    for (task, row), places in zip(rows.items(), panels):
+        for teams, axes in zip(row, places):
             _panel(axes, curves, task, teams)
     canvas.supylabel(METRICS[figure.shows], fontsize=9, color=INK)
     canvas.supxlabel(METRICS[figure.against], fontsize=9, color=INK)
@@ -56,10 +58,10 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     if not figure.scattered:
         axes.xaxis.set_major_formatter(compact)
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    sizes = ', '.join(str(team.num_agents) for team in teams)
+    sizes = f', N = {", ".join(str(team.num_agents) for team in teams)}' if teams else ''
     longer = {curve: curves.longer[teams[0], curve] for curve in figure.curves} if len(teams) == 1 else {}
     alone = '; thin: seed 1 alone' if any(longer.values()) else ''
-    axes.set_title(f'{task}, N = {sizes or "none yet"}   {_seeds(curves, teams)}{alone}', loc='left', fontsize=9, color=INK)
+    axes.set_title(f'{task}{sizes}   {_seeds(_counts(curves, teams))}{alone}', loc='left', fontsize=9, color=INK)
     if figure.shows == 'mean_return' and teams:
         _yardsticks(axes, curves, teams)
     if figure.scattered:
@@ -75,9 +77,11 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     axes.margins(y=0.1)
     limits = axes.get_ylim()
     for curve, band in bands.items():
-        axes.fill_between(band.steps, band.mean - band.half, band.mean + band.half, color=_colour(curves, curve), alpha=0.2,
-                          linewidth=0)
+        low, high = np.clip([band.mean - band.half, band.mean + band.half], *POSSIBLE.get(figure.shows, (-np.inf, np.inf)))
+        axes.fill_between(band.steps, low, high, color=_colour(curves, curve), alpha=0.2, linewidth=0)
     axes.set_ylim(limits)  # of two seeds the interval can be wider than everything else there is to see
+    if not bands:
+        axes.set(xticks=[], yticks=[])
 
 
 def _points(axes: Axes, curves: Curves, teams: Sequence[Team]) -> None:
@@ -94,11 +98,14 @@ def _colour(curves: Curves, curve: str) -> str:
     return ROBOTS[curves.figure.palette.index(curve) % len(ROBOTS)]
 
 
-def _seeds(curves: Curves, teams: Sequence[Team]) -> str:
-    """How many seeds are behind the curves of a panel."""
-    counts = sorted({count for curve in curves.figure.curves for count in curves.counts(teams, curve) if count})
+def _counts(curves: Curves, teams: Sequence[Team]) -> list[int]:
+    """The numbers of seeds behind the curves of a panel, ascending."""
+    return sorted({count for curve in curves.figure.curves for count in curves.counts(teams, curve) if count})
+
+
+def _seeds(counts: list[int]) -> str:
     if not counts:
-        return ''
+        return 'not trained yet'
     if len(counts) > 1:
         return f'{counts[0]} to {counts[-1]} seeds'
     return '1 seed' if counts == [1] else f'{counts[0]} seeds'
