@@ -86,7 +86,7 @@ class TeamNode(Node):
         self._refusals: Counter[tuple[str, str]] = Counter()
         self._diagnostics = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.EVENTS)
         self.every(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
-        take_overlooked(self)
+        look_for_overlooked(self)
 
     def publisher(self, kind: type, topic: str, profile: QoSProfile) -> Publisher:
         """A publisher whose partners coming and going call `on_matched`."""
@@ -220,7 +220,7 @@ def is_over(training: TrainingStatus) -> bool:
     return training.state in (TrainingStatus.FINISHED, TrainingStatus.FAILED)
 
 
-def take_overlooked(node: Node) -> Timer:
+def look_for_overlooked(node: Node) -> None:
     """Hands latched messages that lie unread to their callbacks, one of each topic each `OVERLOOKED_PERIOD`.
 
     rmw_fastrtps counts what a new subscription has unread and only then listens for more. What comes between is announced with
@@ -234,7 +234,7 @@ def take_overlooked(node: Node) -> Timer:
                 if taken is not None:
                     subscription.callback(taken[0])
 
-    return node.create_timer(OVERLOOKED_PERIOD, take, clock=STEADY)
+    node.create_timer(OVERLOOKED_PERIOD, take, clock=STEADY)
 
 
 def set_timers_anew(nodes: Iterable[Node]) -> None:

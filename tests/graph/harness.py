@@ -26,7 +26,7 @@ from dae_ros.report.summary import Summary
 from dae_ros.rollout.in_process import train
 from dae_ros.ros import names, qos
 from dae_ros.ros.graph import NodeProcess, training_graph
-from dae_ros.ros.node import Executor, take_overlooked
+from dae_ros.ros.node import Executor, look_for_overlooked
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
@@ -156,7 +156,7 @@ class Listener:
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
         self.node = rclpy.create_node('listener', context=self.context, namespace=namespace)
-        take_overlooked(self.node)
+        look_for_overlooked(self.node)
         self.executor = Executor(context=self.context)
         self.executor.add_node(self.node)
 
