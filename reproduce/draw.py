@@ -58,11 +58,12 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     if not figure.scattered:
         axes.xaxis.set_major_formatter(compact)
     axes.xaxis.set_major_locator(MaxNLocator(5))
+    counts = _counts(curves, teams)
     sizes = f', N = {", ".join(str(team.num_agents) for team in teams)}' if teams else ''
     longer = {curve: curves.longer[teams[0], curve] for curve in figure.curves} if len(teams) == 1 else {}
     alone = '; thin: seed 1 alone' if any(longer.values()) else ''
-    axes.set_title(f'{task}{sizes}   {_seeds(_counts(curves, teams))}{alone}', loc='left', fontsize=9, color=INK)
-    if figure.shows == 'mean_return' and teams:
+    axes.set_title(f'{task}{sizes}   {_seeds(counts)}{alone}', loc='left', fontsize=9, color=INK)
+    if figure.shows == 'mean_return' and counts:
         _yardsticks(axes, curves, teams)
     if figure.scattered:
         _points(axes, curves, teams)
