@@ -63,7 +63,10 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     longer = {curve: curves.longer[teams[0], curve] for curve in figure.curves} if len(teams) == 1 else {}
     alone = '; thin: seed 1 alone' if any(longer.values()) else ''
     axes.set_title(f'{task}{sizes}   {_seeds(counts)}{alone}', loc='left', fontsize=9, color=INK)
-    if figure.shows == 'mean_return' and counts:
+    if not counts:
+        axes.set(xticks=[], yticks=[])
+        return
+    if figure.shows == 'mean_return':
         _yardsticks(axes, curves, teams)
     if figure.scattered:
         _points(axes, curves, teams)
@@ -81,8 +84,6 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
         low, high = np.clip([band.mean - band.half, band.mean + band.half], *POSSIBLE.get(figure.shows, (-np.inf, np.inf)))
         axes.fill_between(band.steps, low, high, color=_colour(curves, curve), alpha=0.2, linewidth=0)
     axes.set_ylim(limits)  # of two seeds the interval can be wider than everything else there is to see
-    if not bands:
-        axes.set(xticks=[], yticks=[])
 
 
 def _points(axes: Axes, curves: Curves, teams: Sequence[Team]) -> None:
