@@ -5,7 +5,7 @@
 
 Runs go to runs/reproduce/, results to docs/results/ and docs/results.md, also while some runs are still missing. Figures share
 the runs they have in common. Whatever interrupts it, the same command goes on from there; more steps or seeds go on from what
-there is.
+there is. Runs whose records lie in docs/results/runs/ are not trained again: to see for yourself, give other --runs and --docs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from reproduce import figures, schedule
 from reproduce.figures import Figure
 from reproduce.progress import Progress
 from reproduce.records import Records
-from reproduce.results import write_results
+from reproduce.results import results_folder, write_results
 
 REFRESH_PERIOD = 600.0  # s at least between two drawings, which take some seconds, while runs are being trained
 
@@ -58,8 +58,8 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
 
 def show(chosen: list[Figure], records: Records) -> None:
     """A line for each figure and one for all: how many runs are done, and the core hours left at the speed of those done."""
-    speed = records.speed()
     everything = [run for figure in chosen for run in figure.all_runs()]
+    speed = records.speed(set(everything))
     for name, runs in [*((f'{figure.name:26}{figure.title}', figure.all_runs()) for figure in chosen), ('all', everything)]:
         todo = schedule.jobs(runs, records)
         steps = sum(job.run.steps - job.begins_at for job in todo)
@@ -98,7 +98,7 @@ def reproduce(chosen: list[Figure], workers: int, records: Records, docs: Path) 
 def main(arguments: list[str] | None = None) -> int:
     options = parse_arguments(arguments)
     interrupt_on_sigterm()
-    records = Records(options.runs)
+    records = Records(options.runs, results_folder(options.docs))
 
     def act() -> int:
         chosen = figures.load(options.figures, options.seeds, options.steps, options.short)

@@ -16,7 +16,6 @@ from reproduce.records import Records
 from reproduce.statistics import binned, mean_and_interval
 
 POINTS = 100  # bins of a run, at least; at most twice as many
-SPENT = ('seconds/collecting', 'seconds/learning')
 COLUMNS = {'mean_return': 'mean_return', 'win_rate': 'win_rate', 'advantage/deviation': 'advantage_deviation',
            'reward_network/explained_variance': 'reward_explained_variance', 'policy/entropy': 'policy_entropy',
            'expected_reward/explained': 'expected_reward_explained', 'credit/explained': 'credit_explained', SECONDS: 'seconds'}
@@ -51,7 +50,7 @@ class Curves:
         for team in figure.teams:
             for curve in figure.curves:
                 runs = figure.runs(team, curve)
-                width = max(1, runs[0].updates // POINTS)
+                width = max(1, runs[0].updates // POINTS) * runs[0].steps_per_update
                 self.seeds[team, curve] = [_seed(run, width, records) for run in runs if records.finished(run)]
                 longer = figure.longer_run(team, curve)
                 self.longer[team, curve] = (_seed(longer, width, records)
@@ -97,17 +96,16 @@ class Curves:
 
 def _seed(run: Run, width: int, records: Records) -> Seed:
     columns = records.metrics(run)
-    rows = len(columns[STEPS])
-    missing = np.full(rows, np.nan)  # a run without reward networks has no metrics of them
-    metrics = {metric: binned(columns.get(metric, missing), width) for metric in COLUMNS}
-    ends = np.arange(1, len(metrics['mean_return']) + 1) * min(width, rows)
-    steps = columns[STEPS][ends - 1]
+    steps = columns[STEPS]
+    missing = np.full(len(steps), np.nan)  # a run without reward networks has no metrics of them
+    metrics = {metric: binned(steps, columns.get(metric, missing), width) for metric in COLUMNS}
+    ends = np.arange(1, len(metrics['mean_return']) + 1) * min(width, int(steps[-1]))
     # The usual time of an update: what else the machine did now and then must not move the curve.
-    metrics[SECONDS] = ends * np.median(sum(columns[part] for part in SPENT))
+    metrics[SECONDS] = ends / run.steps_per_update * np.median(columns[SECONDS])
     credit = records.credit(run)
     for metric, name in PROBED.items():
         if run.exact:
-            metrics[metric] = np.ones(len(steps))
+            metrics[metric] = np.ones(len(ends))
         elif credit:
-            metrics[metric] = np.interp(steps, credit[STEPS], credit[name])
-    return Seed(run, steps, metrics)
+            metrics[metric] = np.interp(ends, credit[STEPS], credit[name])
+    return Seed(run, ends, metrics)

@@ -1,4 +1,4 @@
-"""What is kept of the figures: docs/results/<figure>.csv and .png, and the tables in docs/results.md."""
+"""What is kept of the figures: docs/results/<figure>.csv and .png, the tables in docs/results.md, and the records of their runs."""
 
 from __future__ import annotations
 
@@ -12,12 +12,20 @@ from reproduce.records import Records
 from reproduce.tables import figure_block, write_block
 
 
+def results_folder(docs: Path) -> Path:
+    """Where all but the tables lie."""
+    return docs / 'results'
+
+
 def write_results(figures: Iterable[Figure], records: Records, docs: Path) -> None:
     """Writes every figure anew that has a finished run."""
-    (docs / 'results').mkdir(parents=True, exist_ok=True)
+    results = results_folder(docs)
+    results.mkdir(parents=True, exist_ok=True)
     for figure in figures:
+        for run in figure.all_runs():
+            records.keep(run)
         curves = Curves(figure, records)
         if any(curves.seeds.values()):
-            curves.write_csv(docs / 'results' / f'{figure.name}.csv')
-            draw(curves, docs / 'results' / f'{figure.name}.png')
+            curves.write_csv(results / f'{figure.name}.csv')
+            draw(curves, results / f'{figure.name}.png')
             write_block(docs / 'results.md', figure.name, figure_block(curves, records))

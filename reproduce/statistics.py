@@ -31,16 +31,16 @@ def mean_and_interval(groups: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndar
     return mean, student.ppf((1 + CONFIDENCE) / 2, effective) * np.sqrt(total)
 
 
-def binned(values: np.ndarray, width: int) -> np.ndarray:
-    """Means [rows // width] over `width` rows each; rows without a number are left out, and so is a last bin that is not full.
+def binned(steps: np.ndarray, values: np.ndarray, width: int) -> np.ndarray:
+    """Means [bins] of `values` [rows] over `width` environment steps each, given the `steps` [rows] at the end of every row.
 
-    Fewer rows than one bin make one.
+    Rows without a number are left out, and so is a last bin that is not full. Fewer steps than one bin make one.
     """
-    width = min(width, len(values))
-    rows = values[:len(values) // width * width].reshape(-1, width)
-    known = np.isfinite(rows)
-    count = known.sum(1)
-    return np.where(count > 0, np.where(known, rows, 0.0).sum(1) / np.maximum(count, 1), np.nan)
+    bins = max(1, int(steps[-1]) // width)
+    place = np.minimum(np.ceil(steps / width), bins + 1).astype(int) - 1 if steps[-1] >= width else np.zeros(len(steps), int)
+    known = np.isfinite(values) & (place < bins)
+    count, total = (np.bincount(place[known], weights, minlength=bins) for weights in (None, values[known]))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def steps_to_reach(threshold: float, steps: np.ndarray, values: np.ndarray) -> float | None:

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from scipy.stats import t as student
 
 from dae_ros import config
 from dae_ros.errors import RunFolderError, SettingsError
-from dae_ros.report.metrics import MetricsLog
+from dae_ros.report.metrics import STEPS, MetricsLog
 from dae_ros.run_folder import RunFolder
 from dae_ros.weights.codec import decode_reward_network
 from reproduce import figures, run, schedule
@@ -138,7 +139,7 @@ def test_a_killed_run_goes_on_to_the_weights_of_one_that_was_not(tmp_path):
 def test_a_stopped_run_loses_nothing(tmp_path):
     with pytest.raises(run.Stopped):
         run.run(tmp_path / 'stopped', settings(total_steps=24), after(3))
-    assert Records(tmp_path).progress('stopped')[0] == 12
+    assert Records(tmp_path, tmp_path).progress('stopped')[0] == 12
     for name in ('stopped', 'whole'):
         run.run(tmp_path / name, settings(total_steps=24), never)
     assert weights(tmp_path / 'stopped', 24) == weights(tmp_path / 'whole', 24)
@@ -149,7 +150,7 @@ def test_a_run_that_ended_goes_on_when_more_steps_are_wanted(tmp_path):
         run.run(tmp_path / 'longer', settings(total_steps=steps), never)
     run.run(tmp_path / 'whole', settings(total_steps=24), never)
     assert weights(tmp_path / 'longer', 24) == weights(tmp_path / 'whole', 24) != weights(tmp_path / 'longer', 8)
-    records = Records(tmp_path)
+    records = Records(tmp_path, tmp_path)
     finished = {steps: records.finished(Run('longer', settings(total_steps=steps))) for steps in (8, 16, 24, 28)}
     assert finished == {8: True, 16: True, 24: True, 28: False}
 
@@ -193,7 +194,7 @@ def test_a_run_may_begin_with_reward_networks_that_learnt_from_a_bag_of_its_own_
 
 def test_first_seeds_come_first_and_what_goes_beyond_the_others_last(tmp_path):
     runs = [run for figure in figures.load(['4', '1b', '4'], seeds=2) for run in figure.all_runs()]
-    todo = schedule.jobs(runs, Records(tmp_path))
+    todo = schedule.jobs(runs, Records(tmp_path, tmp_path))
     assert len(todo) == len(set(runs))
     places = [(job.begins_at > 0, job.run.seed, job.work(0)) for job in todo]
     assert places == sorted(places)
@@ -214,10 +215,9 @@ def pretending(monkeypatch):
 
 
 def test_a_failed_run_is_told_of_and_the_others_go_on(tmp_path, pretending, capsys):
-    pretending(lambda run, records: 'echo no such luck; exit 3' if run.seed == 2 else
-               f'touch {finished_file(records.path(run), 8)}')
+    pretending(lambda run, records: 'echo no such luck; exit 3' if run.seed == 2 else pretend_run(run, records, 1.0))
     runs = [Run(f'run{seed}', settings(total_steps=8, seed=seed)) for seed in (1, 2, 3)]
-    records, ended = Records(tmp_path), []
+    records, ended = Records(tmp_path, tmp_path), []
     with Progress() as progress:
         failed = schedule.train(schedule.jobs(runs, records), 2, records, progress, lambda: ended.append(True))
     assert failed == [runs[1]] and len(ended) == 2
@@ -228,7 +228,7 @@ def test_a_failed_run_is_told_of_and_the_others_go_on(tmp_path, pretending, caps
 def test_an_interruption_stops_the_processes(tmp_path, pretending):
     pretending(lambda run, records: f'trap "touch {records.path(run)}/stopped; exit" TERM; while true; do sleep 0.02; done')
     runs = [Run(f'run{seed}', settings(total_steps=8, seed=seed)) for seed in (1, 2, 3)]
-    records = Records(tmp_path)
+    records = Records(tmp_path, tmp_path)
 
     class Interrupting(Progress):
         def update(self, waiting, running, records):
@@ -263,9 +263,13 @@ def test_the_interval_over_several_groups_holds_the_truth_as_often_as_it_says():
 
 
 @pytest.mark.parametrize('values, width, expected', [
-    ([1.0, 3.0, 5.0, 7.0, 100.0], 2, [2.0, 6.0]), ([1.0, np.nan, np.nan, np.nan], 2, [1.0, np.nan]), ([1.0, 3.0], 5, [2.0])])
+    ([1.0, 3.0, 5.0, 7.0, 100.0], 20, [2.0, 6.0]), ([1.0, np.nan, np.nan, np.nan], 20, [1.0, np.nan]), ([1.0, 3.0], 50, [2.0])])
 def test_bins_are_means_of_whole_bins(values, width, expected):
-    np.testing.assert_array_equal(binned(np.array(values), width), expected)
+    np.testing.assert_array_equal(binned(10 * np.arange(1, 1 + len(values)), np.array(values), width), expected)
+
+
+def test_rows_that_are_bins_already_stay_as_they_are():
+    np.testing.assert_array_equal(binned(np.array([20, 40, 60]), np.array([2.0, 6.0, 4.0]), 20), [2.0, 6.0, 4.0])
 
 
 def test_the_threshold_is_reached_where_the_smoothed_curve_first_does():
@@ -278,8 +282,10 @@ def test_the_threshold_is_reached_where_the_smoothed_curve_first_does():
 # Results, from runs that are made up.
 
 def pretend_run(run, records, level):
+    """Leaves what a training leaves; returns a shell command that does nothing more."""
     path = records.path(run)
     log = MetricsLog(path)
+    (path / 'settings.yaml').write_text(config.to_yaml(run.settings))
     for update in range(1, run.updates + 1):
         log.write(update * run.steps_per_update, {'mean_return': level + update, 'advantage/deviation': 1.0,
                                                   'seconds/collecting': 0.5, 'seconds/learning': 1.5})
@@ -287,6 +293,7 @@ def pretend_run(run, records, level):
     facts = {'environment_steps': run.steps, 'seconds': 3600.0, 'evaluation_return': level, 'versions': {'python': '3'},
              'machine': {'processor': 'abacus', 'cores': 2, 'system': 'wood', 'commit': 'abc'}, 'settings': {'num_agents': 3}}
     finished_file(path, run.steps).write_text(json.dumps(facts))
+    return 'true'
 
 
 @pytest.fixture
@@ -295,7 +302,7 @@ def made_up(tmp_path):
     (tmp_path / 'declared').mkdir()
     (tmp_path / 'declared/some.yaml').write_text(DECLARED)
     figure, = figures.load([], folder=tmp_path / 'declared')
-    records = Records(tmp_path / 'runs')
+    records = Records(tmp_path / 'runs', tmp_path / 'results')
     for curve, level in (('low', 1.0), ('high', 4.0)):
         for team in figure.teams:
             for each in figure.runs(team, curve)[:2]:
@@ -349,6 +356,46 @@ def test_what_is_written_beside_the_markers_survives(made_up, tmp_path):
     assert (tmp_path / 'results.md').read_text() == text.replace('## Figure x\n', '## Figure x\n\nBy hand.\n')
 
 
+def test_results_are_drawn_from_records_where_the_runs_are_gone(made_up, tmp_path):
+    figure, records = made_up
+    first = figure.runs(figure.teams[0], 'high')[0]
+    log = MetricsLog(records.path(first) / 'credit')
+    for steps in (3200, 6400):
+        log.write(steps, {'explained': 1 / 3, 'credit_explained': -1.0})
+    log.close()
+    write_results([figure], records, tmp_path)
+    before = {file: file.read_bytes() for file in (tmp_path / 'results').glob('*.*')}
+    text = (tmp_path / 'results.md').read_text()
+    shutil.rmtree(records.folder)
+    write_results([figure], records, tmp_path)
+    assert (tmp_path / 'results.md').read_text() == text and len(before) == 2
+    assert {file: file.read_bytes() for file in before} == before
+    missing = [job.run for job in schedule.jobs(figure.all_runs(), records)]
+    assert missing == [figure.run(figure.teams[2], curve, 3) for curve in ('low', 'high')]
+
+
+def test_a_record_of_other_settings_is_not_taken_for_the_run(made_up, tmp_path):
+    figure, records = made_up
+    first = figure.runs(figure.teams[0], 'low')[0]
+    records.keep(first)
+    shutil.rmtree(records.folder)
+    assert records.finished(first)
+    assert not records.finished(replace(first, settings=config.from_flat({'gamma': 0.9}, first.settings)))
+    shorter = replace(first, settings=config.from_flat({'total_steps': 3200}, first.settings))
+    assert records.finished(shorter) and records.facts(shorter) is None and records.metrics(shorter)[STEPS].tolist() == [3200]
+
+
+def test_a_longer_record_stays_when_a_shorter_run_is_trained_again(made_up):
+    figure, records = made_up
+    first = figure.runs(figure.teams[0], 'low')[0]
+    records.keep(first)
+    shutil.rmtree(records.path(first))
+    shorter = replace(first, settings=config.from_flat({'total_steps': 3200}, first.settings))
+    pretend_run(shorter, records, 9.0)
+    records.keep(shorter)
+    assert records.metrics(first)['mean_return'].tolist() == [3.0, 4.0]
+
+
 def test_a_block_replaces_only_its_own():
     text = replace_block(replace_block('Top.\n', '1', 'one'), '2', r'two \1')
     assert replace_block(text, '1', 'uno') == text.replace('one', 'uno')
@@ -357,7 +404,7 @@ def test_a_block_replaces_only_its_own():
 def test_csv_rows_are_few_and_the_longer_run_is_in_them_once(tmp_path):
     figure, = figures.load(['1b'])
     team, = figure.teams
-    records = Records(tmp_path)
+    records = Records(tmp_path / 'runs', tmp_path / 'results')
     longer = figure.longer_run(team, 'beta 1')
     pretend_run(longer, records, 1.0)
     Curves(figure, records).write_csv(tmp_path / 'some.csv')
