@@ -143,12 +143,25 @@ def predicted_rewards(states, actions, num_actions, p, start, cut):
             before[t, world] = taken[t - 1, world]
     trunk = layer_norm(torch.relu(linear(torch.cat([states, before], -1), p, 'trunk')), p, 'trunk_norm')
     remembered = layer_norm(memories(trunk, p, start, cut), p, 'gru_norm')
-    hidden = [torch.relu(linear(joined(remembered, actions, agent, num_actions, p), p, 'hidden')) for agent in agents]
-    return torch.stack([linear(layer_norm(x, p, 'hidden_norm'), p, 'head') for x in hidden], 2)
+    hidden = layer_norm(torch.relu(linear(remembered, p, 'hidden')), p, 'hidden_norm')
+    told = linear(hidden, p, 'head').unflatten(-1, (len(agents), num_actions, -1))  # a number and a vector for each action
+    mean, deviation = p['scale'].detach()
+    return mean + deviation * torch.stack([torch.stack([
+        of_joint_action(told, torch.cat([actions[..., :agent], torch.full_like(actions[..., :1], own), actions[..., agent + 1:]], -1))
+        for own in range(num_actions)], -1) for agent in agents], 2)
+
+
+def of_joint_action(told, actions):
+    """[T, W]."""
+    N = actions.shape[-1]
+    chosen = [told[..., agent, :, :].gather(-2, actions[..., agent, None, None].expand(*actions.shape[:-1], 1, told.shape[-1]))
+              .squeeze(-2) for agent in range(N)]
+    pairs = sum((chosen[i][..., 1:] * chosen[j][..., 1:]).sum(-1) for i in range(N) for j in range(i))
+    return sum(one[..., 0] for one in chosen) + pairs / N ** 2
 
 
 def adam_step(p, loss, max_norm):
-    gradients = torch.autograd.grad(loss, list(p.values()))
+    gradients = torch.autograd.grad(loss, list(p.values()), allow_unused=True, materialize_grads=True)
     norm = math.sqrt(sum(float(gradient.square().sum()) for gradient in gradients))
     shorter = min(1.0, max_norm / norm)
     return {name: (tensor - shorter * g / (shorter * g.abs() + 1)).detach().numpy()
@@ -223,7 +236,8 @@ def reference_update(state, trajectory, settings, members):
            'critic': adam_step(critic, settings.value_coefficient * value_loss, norm)}
     for network, prediction in zip(networks[2:], predicted):
         error = prediction.gather(-1, actions[..., None]).squeeze(-1) - rewards[..., None]
-        new[network] = adam_step(weights[network], error.square().mean() / 2, norm)
+        unit = weights[network]['scale'].detach()[1] if 'scale' in weights[network] else 1.0
+        new[network] = adam_step(weights[network], (error / unit).square().mean() / 2, norm)
     return new, (mean, mean_square, weight)
 
 
@@ -279,6 +293,7 @@ def test_an_update_is_the_paper_s_formulas_step_by_step(case, make_learner):
             np.testing.assert_allclose(learnt[name], tensor, rtol=1e-4, atol=2e-6, err_msg=f'{network} {name}')
         moved = {name: np.abs(tensor - before[f'{network}.parameters.{name}']).max()
                  for name, tensor in tensors.items()}
+        moved.pop('scale', None)  # taken from the first rewards, and not learnt
         if spec.num_agents == 1:
             moved.pop('action_embedding', None)  # there are no others to learn from
         assert min(moved.values()) > 1e-5, network

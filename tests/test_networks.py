@@ -9,6 +9,7 @@ import torch
 
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
 from dae_ros.learning.gru import gru_sequence
+from dae_ros.learning import joint_reward
 from dae_ros.learning.networks import REWARD_NETWORKS, make_actor, make_critic, make_reward_network
 from dae_ros.types import WorldSpec
 
@@ -79,7 +80,13 @@ def test_a_batch_without_rows_has_states_without_rows():
 
 
 def reward_network(architecture, seed=1, member=0):
-    return make_reward_network(SPEC, replace(REWARD, architecture=architecture), seed, member)
+    """One that has taken its scale, and minds earlier actions as it does once it has learnt."""
+    network = make_reward_network(SPEC, replace(REWARD, architecture=architecture), seed, member)
+    network.take_scale(normal(20))
+    if architecture == 'shared_trunk':
+        with torch.no_grad():
+            network.trunk.weight[:, SPEC.state_size:] = normal(REWARD.trunk_size, SPEC.num_agents * SPEC.num_actions)
+    return network
 
 
 def some_actions(*shape, seed=2):
@@ -249,25 +256,57 @@ def test_actor_and_critic_begin_orthogonal_with_the_paper_s_gains(make, head_gai
 
 
 @REWARDS
-def test_the_reward_network_begins_orthogonal_with_a_head_of_gain_1(architecture):
-    for name, parameter in reward_network(architecture).named_parameters():
-        if parameter.dim() == 2:
-            expected = 1.0 if name.startswith(('gru', 'head')) else math.sqrt(2)
+def test_the_reward_network_begins_orthogonal_and_a_shared_trunk_without_heed_of_earlier_actions(architecture):
+    network = make_reward_network(SPEC, replace(REWARD, architecture=architecture), 1, 0)
+    for name, parameter in network.named_parameters():
+        if parameter.dim() == 2 and name != 'trunk.weight':
+            expected = network.head_gain if name.startswith('head') else 1.0 if name.startswith('gru') else math.sqrt(2)
             assert gain_of(parameter) == pytest.approx(expected, rel=1e-4), name
+    if architecture == 'shared_trunk':
+        of_state, of_actions = network.trunk.weight.split([SPEC.state_size, SPEC.num_agents * SPEC.num_actions], 1)
+        assert of_state.all() and not of_actions.any()
+
+
+def test_a_shared_trunk_learns_in_units_of_the_first_rewards_and_predicts_0_before():
+    network = make_reward_network(SPEC, replace(REWARD, architecture='shared_trunk'), 1, 0)
+    arguments = network, normal(4, 2, SPEC.state_size), some_actions(4, 2), starts(4, 2)
+    assert not predictions(*arguments).any()
+    network.take_scale(torch.full((3,), 7.0))
+    first = predictions(*arguments)
+    assert first.std() > 0.01
+    network.take_scale(torch.tensor([1.0, 5.0]))  # not the first any more
+    assert torch.equal(predictions(*arguments), first)
+    other = make_reward_network(SPEC, replace(REWARD, architecture='shared_trunk'), 1, 0)
+    other.take_scale(torch.tensor([1.0, 5.0]))
+    torch.testing.assert_close(predictions(other, *arguments[1:]), 3.0 + 2.0 * (first - 7.0))
+
+
+@pytest.mark.parametrize('agents', [1, 2, 4])
+def test_what_all_own_actions_are_worth_is_what_their_joint_actions_are(agents):
+    outputs = normal(5, 3, joint_reward.size(agents, 3))
+    actions = torch.randint(3, (5, 3, agents), generator=torch.Generator().manual_seed(1))
+    found = joint_reward.of_own_actions(outputs, actions)
+    for agent, action in itertools.product(range(agents), range(3)):
+        joint = actions.clone()
+        joint[..., agent] = action
+        torch.testing.assert_close(found[..., agent, action], joint_reward.of_joint_action(outputs, joint))
+    every = outputs.view(5, 3, agents, 3, -1).gather(3, actions[..., None, None].expand(-1, -1, -1, 1, 1 + joint_reward.RANK))
+    alone, vectors = every[..., 0, 0], every[..., 0, 1:]
+    pairs = sum((vectors[..., i, :] * vectors[..., j, :]).sum(-1) for i in range(agents) for j in range(i))
+    torch.testing.assert_close(joint_reward.of_joint_action(outputs, actions), alone.sum(-1) + pairs / agents ** 2)
 
 
 @NETWORKS
 def test_biases_begin_at_0_and_layer_norms_as_the_identity(name):
     for path, parameter in begin()[name].named_parameters():
-        if parameter.dim() == 1:
+        if parameter.dim() == 1 and path != 'scale':
             scale = 'norm' in path and path.endswith('weight')
             assert (parameter == (1.0 if scale else 0.0)).all(), path
 
 
-@REWARDS
 @pytest.mark.parametrize(('steps', 'looked_up'), [(12, True), (1, False)])
-def test_the_way_back_of_a_table_by_hand_is_that_of_autograd_to_the_network_s_first_parameters(architecture, steps, looked_up):
-    network = reward_network(architecture).double()
+def test_the_way_back_of_a_table_by_hand_is_that_of_autograd_to_the_network_s_first_parameters(steps, looked_up):
+    network = reward_network('per_agent').double()
     with torch.no_grad():
         network.action_bias.copy_(normal(*network.action_bias.shape))
     table = network._table(some_actions(steps, 6), None)

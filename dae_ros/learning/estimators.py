@@ -53,19 +53,23 @@ class ActionNetwork:
         network = self.adam.network
         return self._passes.forward(network, network.states_per_world(), inputs, data.episode_start[:-1], data.actions)
 
+    def take_scale(self, targets: Tensor) -> None:
+        """To be told the first numbers it is to learn, of any shape, before it learns them."""
+        self.adam.network.take_scale(targets)
+
     def training(self, batches: Iterable[Batch], loss_name: str) -> Training:
         """Gradient steps of half the squared error on batches of `ActionChunks`."""
         network = self.adam.network
 
         def gradient(shard: ActionChunks, initial: Tensor, shared: Table | None = None) -> tuple[Tensor, Tensor]:
-            loss = losses.RewardLoss(shard.actions, shard.targets, shard.weights)
+            loss = network.loss(shard.actions, shard.targets, shard.weights)
             return network.gradient(loss, shard.inputs, initial, shard.episode_start, shard.actions, shared)
 
         @torch.no_grad()
         def shared(chunks: ActionChunks) -> Table | None:
             return network.shared_table(chunks.actions)
 
-        return self._passes.train(self.name, self.adam, gradient, batches, network.num_agents, (loss_name,), shared)
+        return self._passes.train(self.name, self.adam, gradient, batches, network.states_per_world(), (loss_name,), shared)
 
 
 def ensemble_prediction(members: Sequence[ActionNetwork], data: Trajectory) -> tuple[Tensor, Tensor, list[Tensor]]:
@@ -212,6 +216,7 @@ class DifferenceEstimator:
             self._replay.add(chunks, firsts)
         trainings = []
         for member, (network, first) in enumerate(zip(self._reward, firsts)):
+            network.take_scale(data.rewards)
             if self._replay:
                 batches = self._replay.batches(member, rollout)
             else:
@@ -259,7 +264,9 @@ class CounterfactualEstimator:
         targets = advantages.lambda_returns(data.rewards, of_team, continues, cut_off, settings.gamma, settings.gae_lambda)
         explained = 1 - (of_team - targets).square().mean() / targets.var(correction=0).clamp_min(1e-12)
         self._value_norm.update(targets)
-        chunks = action_chunks(data, inputs, self._value_norm.normalize(targets), settings)
+        targets = self._value_norm.normalize(targets)
+        network.take_scale(targets)
+        chunks = action_chunks(data, inputs, targets, settings)
         batches = self._passes.epochs(network.name, chunks, first_states(states, len(chunks.weights)), self._epochs,
                                       settings.num_mini_batches, rollout)
         return Estimate(estimated, [network.training(batches, 'action_value/loss')],

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from dae_ros.learning.native.library import CArray, CBatch, CLoss, CStep, c_step, chosen
 
-_LOSSES = {'policy': 0, 'value': 1, 'reward': 2}
+_LOSSES = {'policy': 0, 'value': 1, 'reward': 2, 'joint_reward': 3}
+_OF_TEAM = ('reward', 'joint_reward')  # whose targets are [L, C]
 _MOST_SUMS = 4
 
 
@@ -43,7 +44,7 @@ class Batch(NamedTuple):
 class LossTerms(NamedTuple):
     """A loss as the kernels take it (see native/kernels.c)."""
 
-    kind: str                   # 'policy', 'value' or 'reward'
+    kind: str                   # 'policy', 'value', 'reward' or 'joint_reward'
     numbers: tuple[float, ...]  # at most 3
     actions: Tensor | None      # [L, C, N] int64
     data: tuple[Tensor, ...]    # at most 2
@@ -91,10 +92,10 @@ def gradient(steps: Sequence[Step], parameters: Sequence[Tensor], batch: Batch,
     columns = batch.episode_start.shape
     agents = (*columns, batch.num_agents)
     rows, outputs = _rows(steps, batch)[0], steps[-1].outputs
-    if rows != batch.num_agents or loss.kind == 'value' and outputs != 1:
+    if rows != (1 if loss.kind == 'joint_reward' else batch.num_agents) or loss.kind == 'value' and outputs != 1:
         raise ValueError(f'no {loss.kind} loss of {rows} rows of {outputs} outputs for {batch.num_agents} agents')
     numbers = loss.numbers + (0.0,) * (3 - len(loss.numbers))
-    shape = columns if loss.kind == 'reward' else agents
+    shape = columns if loss.kind in _OF_TEAM else agents
     data = [_array(x, shape, torch.float32, kept) for x in (*loss.data, None)[:2]]
     weights = _array(loss.weights, agents, torch.float32, kept)
     terms = CLoss(_LOSSES[loss.kind], (ctypes.c_double * 3)(*numbers), _array(loss.actions, agents, torch.int64, kept),

@@ -1,4 +1,4 @@
-"""The three losses as sums over weighted rows, so that shards of a batch add up to the batch.
+"""The losses as sums over weighted rows, so that shards of a batch add up to the batch.
 
 Each is a function of a network's outputs [L, C, rows, K] that gives what is to be differentiated and sums worth showing,
 and knows its terms for the compiled kernels, which compute the same.
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dae_ros.learning import joint_reward
 from dae_ros.learning.kernels import LossTerms
 
 _UNAVAILABLE = -1e10  # a logit whose probability is exactly 0, and that times its logarithm, too
@@ -95,4 +96,28 @@ class RewardLoss(NamedTuple):
         return LossTerms('reward', (), self.actions, (self.rewards,), self.weights)
 
 
-Loss = Union[PolicyLoss, ValueLoss, RewardLoss]
+class JointRewardLoss(NamedTuple):
+    """The same of a reward predicted once for the team, on the outputs [L, C, 1, N A (1 + R)] of a network (`joint_reward`),
+    which say how far it lies from `mean`, in units of `deviation`. What is differentiated is in these units too."""
+
+    actions: Tensor  # [L, C, N] int64
+    rewards: Tensor  # [L, C]
+    weights: Tensor  # [L, C, N]
+    mean: float
+    deviation: float
+
+    sums = RewardLoss.sums
+
+    def __call__(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        predicted = joint_reward.of_joint_action(outputs.squeeze(-2), self.actions)
+        errors = predicted - (self.rewards - self.mean) / self.deviation
+        loss = (errors.square() * self.weights.sum(-1)).sum() / 2
+        return loss, loss.detach().view(1) * self.deviation ** 2
+
+    @property
+    def terms(self) -> LossTerms:
+        return LossTerms('joint_reward', (joint_reward.RANK, self.mean, self.deviation), self.actions, (self.rewards,),
+                         self.weights)
+
+
+Loss = Union[PolicyLoss, ValueLoss, RewardLoss, JointRewardLoss]

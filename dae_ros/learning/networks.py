@@ -17,10 +17,9 @@ from torch.nn import functional
 
 from dae_ros import draws
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
-from dae_ros.learning import kernels
+from dae_ros.learning import joint_reward, kernels, losses
 from dae_ros.learning.gru import gru_sequence
 from dae_ros.learning.kernels import Batch, Step
-from dae_ros.learning.losses import Loss
 from dae_ros.types import WorldSpec
 
 _ACTIVATIONS = {'identity': lambda x: x, 'relu': torch.relu, 'tanh': torch.tanh}
@@ -128,7 +127,7 @@ class Network(nn.Module):
             return kernels.forward(steps, batch)
         return run_in_torch(steps, batch)
 
-    def gradient(self, loss: Loss, inputs: Tensor, initial: Tensor, episode_start: Tensor,
+    def gradient(self, loss: losses.Loss, inputs: Tensor, initial: Tensor, episode_start: Tensor,
                  actions: Tensor | None = None, shared: Table | None = None) -> tuple[Tensor, Tensor]:
         """d loss / d parameters as one flat vector, and the sums of the loss; the rest as for `forward`.
 
@@ -149,7 +148,7 @@ class Network(nn.Module):
         return flat, sums[:len(loss.sums)]
 
 
-def _gradient_in_torch(steps: Iterable[Step], parameters: Sequence[Tensor], batch: Batch, loss: Loss) -> tuple[Tensor, Tensor]:
+def _gradient_in_torch(steps: Iterable[Step], parameters: Sequence[Tensor], batch: Batch, loss: losses.Loss) -> tuple[Tensor, Tensor]:
     """What `kernels.gradient` computes."""
     leaves = list(parameters)
     with torch.enable_grad():
@@ -207,20 +206,13 @@ def _of_others(x: Tensor) -> Tensor:
 
 
 class RewardNetwork(Network):
-    """r_psi(s, a_-i, .): for every agent the shared reward for each action of its own (paper, section 3.3).
+    """r_psi(s, a_-i, .): for every agent the shared reward for each action of its own (paper, section 3.3)."""
 
-    The zeroed block of agent i's own action is the only thing that tells the agents apart, so what depends on the others'
-    actions alone is computed once a gradient step for all they can do, where that is less than half of what they did (75
-    rows for three agents with five actions).
-    """
+    head_gain = 1.0
 
-    def __init__(self, spec: WorldSpec, settings: RewardNetworkSettings):
+    def __init__(self, spec: WorldSpec):
         super().__init__()
-        hidden_size = settings.hidden_size
         self.num_agents, self.num_actions = spec.num_agents, spec.num_actions
-        self.action_embedding = nn.Parameter(torch.empty(spec.num_agents * spec.num_actions, hidden_size))
-        self.action_bias = nn.Parameter(torch.empty(hidden_size))
-        self.joint_action = nn.Linear(hidden_size, hidden_size)
 
     def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
         """What the network reads of a rollout [T, W, 1, I]: states [T, W, 1, S], actions [T, W, N], episode_start [T, W]."""
@@ -230,9 +222,58 @@ class RewardNetwork(Network):
         """Recurrent states per world: N or 1."""
         raise NotImplementedError
 
+    def loss(self, actions: Tensor, rewards: Tensor, weights: Tensor) -> losses.Loss:
+        """Of the outputs `gradient` differentiates: actions [L, C, N], rewards [L, C], weights [L, C, N]."""
+        raise NotImplementedError
+
+    def begin(self) -> None:
+        """Changes what is to begin otherwise than all networks do."""
+
+    def take_scale(self, rewards: Tensor) -> None:
+        """Lets a network that learns in units of its own take them from the first rewards it learns from, of any shape."""
+
     def shared_table(self, actions: Tensor) -> Table | None:
-        """What the parts of a batch with actions [L, C, N] can share: joint_action(relu(embedding)) of everything the others
-        can do. None if that is more than half of what they did."""
+        """What the parts of a batch with actions [L, C, N] can share; None if there is nothing."""
+        return None
+
+
+class PerAgentRewardNetwork(RewardNetwork):
+    """The paper's: recurrent over the state and a_-i, one sequence per agent.
+
+    The zeroed block of agent i's own action is the only thing that tells the agents apart, so what depends on the others'
+    actions alone is computed once a gradient step for all they can do, where that is less than half of what they did (75
+    rows for three agents with five actions).
+    """
+
+    def __init__(self, spec: WorldSpec, settings: RewardNetworkSettings):
+        super().__init__(spec)
+        hidden_size = self.hidden_size = settings.hidden_size
+        self.action_embedding = nn.Parameter(torch.empty(spec.num_agents * spec.num_actions, hidden_size))
+        self.action_bias = nn.Parameter(torch.empty(hidden_size))
+        self.joint_action = nn.Linear(hidden_size, hidden_size)
+        self.state = nn.Linear(spec.state_size, hidden_size)
+        self.state_norm = nn.LayerNorm(hidden_size)
+        self.joint_state = nn.Linear(hidden_size, hidden_size, bias=False)
+        self.joint_norm = nn.LayerNorm(hidden_size)
+        self.gru = Gru(hidden_size, hidden_size)
+        self.gru_norm = nn.LayerNorm(hidden_size)
+        self.head = nn.Linear(hidden_size, spec.num_actions)
+
+    def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
+        return states
+
+    def states_per_world(self) -> int:
+        return self.num_agents
+
+    def loss(self, actions: Tensor, rewards: Tensor, weights: Tensor) -> losses.Loss:
+        return losses.RewardLoss(actions, rewards, weights)
+
+    def steps(self) -> list[Step]:
+        return [layer(self.state, 'relu', self.state_norm), layer(self.joint_state), fan_out(self.joint_norm),
+                gru(self.gru), layer(norm=self.gru_norm), layer(self.head)]
+
+    def shared_table(self, actions: Tensor) -> Table | None:
+        """joint_action(relu(embedding)) of everything the others can do. None if that is more than half of what they did."""
         N, A = self.num_agents, self.num_actions
         if N * A ** (N - 1) > _LOOK_UP_BELOW * actions.numel():
             return None
@@ -265,50 +306,35 @@ class RewardNetwork(Network):
         return Table(self.joint_action(hidden), None, gradient)
 
 
-class PerAgentRewardNetwork(RewardNetwork):
-    """The paper's: recurrent over the state and a_-i, one sequence per agent."""
-
-    def __init__(self, spec: WorldSpec, settings: RewardNetworkSettings):
-        super().__init__(spec, settings)
-        hidden_size = self.hidden_size = settings.hidden_size
-        self.state = nn.Linear(spec.state_size, hidden_size)
-        self.state_norm = nn.LayerNorm(hidden_size)
-        self.joint_state = nn.Linear(hidden_size, hidden_size, bias=False)
-        self.joint_norm = nn.LayerNorm(hidden_size)
-        self.gru = Gru(hidden_size, hidden_size)
-        self.gru_norm = nn.LayerNorm(hidden_size)
-        self.head = nn.Linear(hidden_size, spec.num_actions)
-
-    def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
-        return states
-
-    def states_per_world(self) -> int:
-        return self.num_agents
-
-    def steps(self) -> list[Step]:
-        return [layer(self.state, 'relu', self.state_norm), layer(self.joint_state), fan_out(self.joint_norm),
-                gru(self.gru), layer(norm=self.gru_norm), layer(self.head)]
-
-
 class SharedTrunkRewardNetwork(RewardNetwork):
-    """One recurrent pass per world over states and all agents' earlier actions, then a small head per agent.
+    """One recurrent pass per world over states and all agents' earlier actions, which tells what each action of each agent
+    adds to the reward there, by itself and together with each other agent's (see `joint_reward`).
 
-    It sees more than the paper's, which never shows an agent its own earlier actions, and costs about a third at N = 3.
+    It sees more than the paper's, which never shows an agent its own earlier actions, and learns what one action does
+    whatever the others do, which the paper's has to find out for every a_-i. It learns in units of the deviation of the first
+    rewards from their mean; until it has seen any it predicts 0. Earlier actions count for nothing at first: where a reward
+    does not depend on them, they are so many numbers to be misled by.
     """
 
+    head_gain = 0.1
+
     def __init__(self, spec: WorldSpec, settings: RewardNetworkSettings):
-        super().__init__(spec, settings)
-        hidden_size, trunk_size = settings.hidden_size, settings.trunk_size
-        self.hidden_size = trunk_size
+        super().__init__(spec)
+        trunk_size = self.hidden_size = settings.trunk_size
         self.trunk = nn.Linear(spec.state_size + spec.num_agents * spec.num_actions, trunk_size)
         self.trunk_norm = nn.LayerNorm(trunk_size)
         self.gru = Gru(trunk_size, trunk_size)
         self.gru_norm = nn.LayerNorm(trunk_size)
-        self.joint_state = nn.Linear(trunk_size, hidden_size, bias=False)
-        self.joint_norm = nn.LayerNorm(hidden_size)
-        self.hidden = nn.Linear(hidden_size, hidden_size)
-        self.hidden_norm = nn.LayerNorm(hidden_size)
-        self.head = nn.Linear(hidden_size, spec.num_actions)
+        self.hidden = nn.Linear(trunk_size, settings.hidden_size)
+        self.hidden_norm = nn.LayerNorm(settings.hidden_size)
+        self.head = nn.Linear(settings.hidden_size, joint_reward.size(spec.num_agents, spec.num_actions))
+        self.scale = nn.Parameter(torch.empty(2))  # mean and deviation; no loss changes them
+
+    def forward(self, inputs: Tensor, initial: Tensor, episode_start: Tensor,
+                actions: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        outputs, states = super().forward(inputs, initial, episode_start, actions)
+        mean, deviation = self.scale
+        return mean + deviation * joint_reward.of_own_actions(outputs.squeeze(-2), actions), states
 
     def inputs(self, states: Tensor, actions: Tensor, episode_start: Tensor) -> Tensor:
         taken = functional.one_hot(actions, self.num_actions).flatten(2).to(states.dtype)
@@ -318,10 +344,22 @@ class SharedTrunkRewardNetwork(RewardNetwork):
     def states_per_world(self) -> int:
         return 1
 
+    def loss(self, actions: Tensor, rewards: Tensor, weights: Tensor) -> losses.Loss:
+        return losses.JointRewardLoss(actions, rewards, weights, *self.scale.tolist())
+
+    @torch.no_grad()
+    def take_scale(self, rewards: Tensor) -> None:
+        if not self.scale[1]:
+            deviation = rewards.std(correction=0)
+            self.scale.copy_(torch.stack([rewards.mean(), torch.where(deviation > 0, deviation, 1)]))
+
+    @torch.no_grad()
+    def begin(self) -> None:
+        self.trunk.weight[:, -self.num_agents * self.num_actions:] = 0
+
     def steps(self) -> list[Step]:
         return [layer(self.trunk, 'relu', self.trunk_norm), gru(self.gru), layer(norm=self.gru_norm),
-                layer(self.joint_state), fan_out(self.joint_norm), layer(self.hidden, 'relu', self.hidden_norm),
-                layer(self.head)]
+                layer(self.hidden, 'relu', self.hidden_norm), layer(self.head)]
 
 
 REWARD_NETWORKS = {'per_agent': PerAgentRewardNetwork, 'shared_trunk': SharedTrunkRewardNetwork}
@@ -343,13 +381,19 @@ def make_critic(spec: WorldSpec, settings: LearnerSettings, seed: int) -> Recurr
 
 def make_reward_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int, member: int) -> RewardNetwork:
     """Member `member` of the reward ensemble (algorithm 1, line 14)."""
-    network = REWARD_NETWORKS[settings.architecture](spec, settings)
-    return _initialise(network, _GAINS['relu'], 1.0, seed, f'reward_network.{member}')
+    return _make_action_network(spec, settings, seed, f'reward_network.{member}')
 
 
 def make_action_value_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int) -> RewardNetwork:
     """Q(s, a_-i, .) of COMA, built like the reward network."""
-    return _initialise(REWARD_NETWORKS[settings.architecture](spec, settings), _GAINS['relu'], 1.0, seed, 'action_value')
+    return _make_action_network(spec, settings, seed, 'action_value')
+
+
+def _make_action_network(spec: WorldSpec, settings: RewardNetworkSettings, seed: int, name: str) -> RewardNetwork:
+    network = REWARD_NETWORKS[settings.architecture](spec, settings)
+    _initialise(network, _GAINS['relu'], network.head_gain, seed, name)
+    network.begin()
+    return network
 
 
 def _initialise(network: nn.Module, hidden_gain: float, head_gain: float, seed: int, name: str):

@@ -191,6 +191,8 @@ class RewardTraining:
             length = chunk_length(data, self._learner)
             data = as_remembered(data, self._reward)
             inputs = self._members[0].inputs(data)
+            for member in self._members:
+                member.take_scale(data.rewards[learnt])
             chunks = action_chunks(data, inputs, data.rewards, self._learner)
             chunks = chunks._replace(weights=chunks.weights * to_chunks(learnt.float(), length).unsqueeze(-1))
             useful = (chunks.weights.sum((0, 2)) > 0).nonzero().flatten()

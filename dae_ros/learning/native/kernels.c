@@ -863,17 +863,20 @@ static void zero_unavailable(long n, float *x, const uint8_t *available) {
 
 /* Losses: sums over weighted rows, each with its gradient. */
 
-enum { POLICY = 0, VALUE = 1, REWARD = 2 };
+enum { POLICY = 0, VALUE = 1, REWARD = 2, JOINT_REWARD = 3 };
 
 typedef struct {
     long kind;
     double numbers[3];
-    Array actions; /* [L, C, N] int64 for POLICY and REWARD */
+    Array actions; /* [L, C, N] int64; not for VALUE */
     Array data[2]; /* POLICY: old log-probabilities, advantages [L, C, N]. VALUE: old values, targets [L, C, N].
-                      REWARD: rewards [L, C] */
+                      REWARD and JOINT_REWARD: rewards [L, C] */
     Array weights; /* [L, C, N] */
     Array available; /* POLICY: [L, C, N, A] bytes, 0 where an action cannot be chosen; NULL: all can */
 } Loss;
+
+/* Whether a target is the team's, not an agent's. */
+static int is_of_team(const Loss *loss) { return loss->kind == REWARD || loss->kind == JOINT_REWARD; }
 
 /* -surrogate (eq. 4) - bonus * entropy, on T rows of A logits; numbers: clip, bonus.
  * To sums [4] is added: the negated surrogate, the entropy, the fraction of clipped ratios, -log ratio. */
@@ -949,7 +952,52 @@ static void reward_loss(long T, long N, long A, const float *predicted, float *g
     }
 }
 
+/* The same of a reward predicted once for the team, on T rows of N A (1 + R) outputs; numbers: R, the rewards' mean and
+ * deviation, from which and in whose units it is predicted. For each action of each agent the outputs are what it adds by
+ * itself, and a vector [R]: the product of two agents' vectors, over N^2, is what their actions add together. sums [1]. */
+static void joint_reward_loss(long T, long N, long O, const Loss *loss, const float *outputs, float *grad, double *sums,
+                              const Scratch *s) {
+    const long width = 1 + (long)loss->numbers[0], of_agent = O / N;
+    const float mean = (float)loss->numbers[1], deviation = (float)loss->numbers[2], of_pair = 1 / (float)(N * N);
+    memset(grad, 0, (size_t)(T * O) * sizeof(float));
+    for (long row = 0; row < T; row++, outputs += O, grad += O) {
+        const int64_t *actions = s->actions + row * N;
+        float predicted = 0, weight = 0;
+        for (long agent = 0; agent < N; agent++) {
+            const long at = agent * of_agent + actions[agent] * width;
+            predicted += outputs[at];
+            grad[at] = 1;
+            weight += s->weights[row * N + agent];
+        }
+        for (long k = 1; k < width; k++) {
+            float sum = 0, squares = 0;
+            for (long agent = 0; agent < N; agent++) {
+                const float x = outputs[agent * of_agent + actions[agent] * width + k];
+                sum += x;
+                squares += x * x;
+            }
+            predicted += (sum * sum - squares) / 2 * of_pair;
+            for (long agent = 0; agent < N; agent++) {
+                const long at = agent * of_agent + actions[agent] * width + k;
+                grad[at] = (sum - outputs[at]) * of_pair;
+            }
+        }
+        const float error = predicted - (s->of_loss[0][row] - mean) / deviation;
+        sums[0] += (double)(error * error * deviation * deviation * weight) / 2;
+        for (long agent = 0; agent < N; agent++)
+            for (long k = 0; k < width; k++)
+                grad[agent * of_agent + actions[agent] * width + k] *= error * weight;
+    }
+}
+
 /* The whole network. */
+
+static long rows_at_end(const Step *steps, long count, const Batch *batch) {
+    for (long i = 0; i < count; i++)
+        if (steps[i].kind == FAN_OUT)
+            return batch->agents;
+    return batch->rows;
+}
 
 static long rows_at_gru(const Step *steps, long count, const Batch *batch) {
     long rows = batch->rows;
@@ -970,7 +1018,9 @@ static long first_in_parts(const Step *steps, long count) {
 }
 
 /* How many of a block's `length` steps of columns a part has. */
-static long part_size(const Batch *batch, long length) { return max(1, min(length, PART / batch->agents)); }
+static long part_size(const Step *steps, long count, const Batch *batch, long length) {
+    return max(1, min(length, PART / rows_at_end(steps, count, batch)));
+}
 
 /* Hands out the memory of the packed weights; those of the backward pass only if the network `learns`. */
 static void plan_weights(Arena *arena, const Step *steps, long count, int learns, Work *works) {
@@ -1008,7 +1058,7 @@ static Scratch plan(Arena *arena, const Step *steps, long count, const Batch *ba
                     Work *works) {
     Scratch s = {0};
     const long length = batch->length * columns, all_rows = length * batch->agents;
-    const long in_parts = first_in_parts(steps, count), part = part_size(batch, length);
+    const long in_parts = first_in_parts(steps, count), part = part_size(steps, count, batch, length);
     long rows = batch->rows, widest = 1, widest_part = 1, inputs = 1, outputs = 1, units = 1;
     for (long i = 0; i < count; i++) {
         const Step *step = steps + i;
@@ -1115,7 +1165,7 @@ static void forward_block(const Step *steps, long count, long outputs, const Bat
             gather(&loss->available, L, first, columns, N * outputs, s->available);
         for (int i = 0; i < 2; i++)
             if (loss->data[i].data)
-                gather(&loss->data[i], L, first, columns, loss->kind == REWARD ? size : N * size, s->of_loss[i]);
+                gather(&loss->data[i], L, first, columns, is_of_team(loss) ? size : N * size, s->of_loss[i]);
         if (loss->actions.data)
             gather(&loss->actions, L, first, columns, N * (long)sizeof(int64_t), s->actions);
     }
@@ -1142,7 +1192,7 @@ static void forward_block(const Step *steps, long count, long outputs, const Bat
  * on. */
 static void run_part(const Step *steps, long from, long count, const Batch *batch, const Loss *loss, long at, long size,
                      const Work *works, float *grad_table, double *sums, const Scratch *of_block) {
-    const long N = batch->agents, last = count - 1, per_step = loss && loss->kind == REWARD ? 1 : N;
+    const long N = batch->agents, last = count - 1, per_step = loss && is_of_team(loss) ? 1 : N;
     Scratch s = *of_block;
     Work own[MOST_STEPS];
     memcpy(own, works, (size_t)count * sizeof(Work));
@@ -1170,8 +1220,10 @@ static void run_part(const Step *steps, long from, long count, const Batch *batc
         policy_loss(rows, outputs, loss, own[last].y, grad, sums, &s);
     else if (loss->kind == VALUE)
         value_loss(rows, loss, own[last].y, grad, sums, &s);
-    else
+    else if (loss->kind == REWARD)
         reward_loss(rows, N, outputs, own[last].y, grad, sums, &s);
+    else
+        joint_reward_loss(rows, N, outputs, loss, own[last].y, grad, sums, &s);
     for (long i = last; i >= from; i--) {
         rows_backward(steps + i, own + i, batch, i > from ? own[i - 1].y : inputs, s.from_part, grad_table,
                       i > from ? s.to_part : below, &s);
@@ -1205,7 +1257,7 @@ static int run(const Step *steps, long count, void *packed, const Batch *batch, 
                float *states, float *grad_table, double *sums) {
     const long L = batch->length, C = batch->columns, size = (long)sizeof(float);
     const long block = max(1, min(C, BLOCK / rows_at_gru(steps, count, batch)));
-    const long in_parts = first_in_parts(steps, count), part = part_size(batch, L * block);
+    const long in_parts = first_in_parts(steps, count), part = part_size(steps, count, batch, L * block);
     const int learns = loss != NULL;
     Work works[MOST_STEPS] = {0};
     Arena arena = {0}, prepared = {packed, 0};
