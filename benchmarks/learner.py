@@ -18,7 +18,7 @@ import torch
 
 from dae_ros import config
 from dae_ros.config import Settings
-from dae_ros.learning import kernels, losses, networks
+from dae_ros.learning import joint_reward, kernels, losses, networks
 from dae_ros.learning.chunks import shard_bounds
 from dae_ros.learning.device import random_trajectory
 from dae_ros.learning.learner import Learner
@@ -49,7 +49,7 @@ def reward_flops(architecture: str, spec: WorldSpec, hidden: int, trunk: int) ->
     square, head = hidden**2, hidden * A
     if architecture == 'per_agent':
         return 2 * (2 * spec.state_size * hidden + 3 * square + 3 * N * (6 * square + head))
-    return 2 * (2 * (spec.state_size + N * A) * trunk + 3 * (6 * trunk**2 + trunk * hidden) + 3 * N * (square + head))
+    return 2 * (2 * (spec.state_size + N * A) * trunk + 3 * (6 * trunk**2 + trunk * hidden + hidden * joint_reward.size(N, A)))
 
 
 def epoch(network: networks.Network, rows: int, inputs: int, spec: WorldSpec, chunks: int, length: int) -> Callable[[], None]:
@@ -59,7 +59,8 @@ def epoch(network: networks.Network, rows: int, inputs: int, spec: WorldSpec, ch
         actions, weights = torch.randint(spec.num_actions, (L, C, N)), torch.full((L, C, N), 1 / (L * C * N))
         per_agent, per_world = torch.randn(2, L, C, N), torch.randn(2, L, C, 1)
         if isinstance(network, networks.RewardNetwork):
-            loss = losses.RewardLoss(actions, per_world[0, ..., 0], weights)
+            network.take_scale(per_world[0])
+            loss = network.loss(actions, per_world[0, ..., 0], weights)
         elif rows == 1:
             loss = losses.ValueLoss(*per_world, N * weights[..., :1], 0.2, 10.0, 1.0)
         else:

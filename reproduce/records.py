@@ -142,7 +142,8 @@ def _columns(file: Path) -> dict[str, np.ndarray]:
 def _encoded(record: Record) -> str:
     """As JSON, a column or an end on each line; five digits are more than any figure shows."""
     def column(name: str, values: np.ndarray) -> str:
-        numbers = [int(value) if name == STEPS else None if math.isnan(value) else float(f'{value:.{DIGITS}g}') for value in values]
+        numbers = values.astype(int).tolist() if name == STEPS else [
+            None if math.isnan(value) else float(f'{value:.{DIGITS}g}') for value in values]
         return json.dumps(numbers, separators=(',', ':'))
 
     def block(entries: Mapping[str, str]) -> str:

@@ -1,4 +1,4 @@
-"""What is kept of the figures: docs/results/<figure>.csv and .png, the tables in docs/results.md, and the records of their runs."""
+"""What is kept: docs/results/<figure>.csv and .png, the tables in docs/results.md, and the records of the runs."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from dae_ros.weights.codec import decode_checkpoint, encode_checkpoint, encode_p
 
 SPEC = WorldSpec(num_agents=3, num_actions=4, observation_size=5, state_size=7, state_is_observations=False)
 LEARNER = LearnerSettings(hidden_size=8, epochs=2, beta=0.9, learner_threads=1)
-REWARD = RewardNetworkSettings(hidden_size=12, trunk_size=10, epochs=2)
+REWARD = RewardNetworkSettings('per_agent', hidden_size=12, trunk_size=10, epochs=2)
 SHARED_TRUNK = replace(REWARD, architecture='shared_trunk')
 COMA = replace(LEARNER, estimator='coma')
 REPLAY = replace(REWARD, replay_rollouts=2, replay_steps=5, replay_chunks=3)
@@ -146,9 +146,14 @@ def predicted_rewards(states, actions, num_actions, p, start, cut):
     hidden = layer_norm(torch.relu(linear(remembered, p, 'hidden')), p, 'hidden_norm')
     told = linear(hidden, p, 'head').unflatten(-1, (len(agents), num_actions, -1))  # a number and a vector for each action
     mean, deviation = p['scale'].detach()
-    return mean + deviation * torch.stack([torch.stack([
-        of_joint_action(told, torch.cat([actions[..., :agent], torch.full_like(actions[..., :1], own), actions[..., agent + 1:]], -1))
-        for own in range(num_actions)], -1) for agent in agents], 2)
+
+    def acting(agent, own):
+        joint = actions.clone()
+        joint[..., agent] = own
+        return of_joint_action(told, joint)
+
+    return mean + deviation * torch.stack([torch.stack([acting(agent, own) for own in range(num_actions)], -1)
+                                           for agent in agents], 2)
 
 
 def of_joint_action(told, actions):

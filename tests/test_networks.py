@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from dae_ros.config import LearnerSettings, RewardNetworkSettings
-from dae_ros.learning.gru import gru_sequence
 from dae_ros.learning import joint_reward
+from dae_ros.learning.gru import gru_sequence
 from dae_ros.learning.networks import REWARD_NETWORKS, make_actor, make_critic, make_reward_network
 from dae_ros.types import WorldSpec
 

@@ -148,7 +148,8 @@ class Network(nn.Module):
         return flat, sums[:len(loss.sums)]
 
 
-def _gradient_in_torch(steps: Iterable[Step], parameters: Sequence[Tensor], batch: Batch, loss: losses.Loss) -> tuple[Tensor, Tensor]:
+def _gradient_in_torch(steps: Iterable[Step], parameters: Sequence[Tensor], batch: Batch,
+                       loss: losses.Loss) -> tuple[Tensor, Tensor]:
     """What `kernels.gradient` computes."""
     leaves = list(parameters)
     with torch.enable_grad():
