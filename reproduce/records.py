@@ -16,6 +16,7 @@ import numpy as np
 
 from dae_ros import config
 from dae_ros.config import Settings
+from dae_ros.errors import SettingsError
 from dae_ros.files import write_atomically
 from dae_ros.report.metrics import STEPS, read_metrics
 from reproduce.figures import SECONDS, Run
@@ -128,11 +129,17 @@ class Records:
 
     def _in_file(self, run: Run) -> Record | None:
         file = self._file(run)
-        return _decoded(file.read_text(encoding='utf-8')) if file.exists() else None
+        try:
+            return _decoded(file.read_text(encoding='utf-8')) if file.exists() else None
+        except SettingsError:  # of a setting that is no more: no run of today
+            return None
 
 
 def _settings(settings: Settings) -> dict[str, Any]:
-    return config.flatten(config.from_flat(OF_THE_FOLDER_ALONE, settings))
+    """Those that make it another run: plain MAPPO has no reward network, whatever that would be like."""
+    values = config.flatten(config.from_flat(OF_THE_FOLDER_ALONE, settings))
+    without_reward = settings.learner.estimator == 'dae' and settings.learner.beta == 0
+    return {name: value for name, value in values.items() if not (without_reward and name.startswith('reward_network.'))}
 
 
 def _columns(file: Path) -> dict[str, np.ndarray]:
@@ -157,10 +164,9 @@ def _encoded(record: Record) -> str:
 
 
 def _decoded(text: str) -> Record:
-    """What `_encoded` wrote; a setting that has been declared since had its default then."""
+    """What `_encoded` wrote. A setting that has been declared since had its default then."""
     content = json.loads(text)
     columns = {part: {name: np.array(values, dtype=np.float64) for name, values in content[part].items()}
                for part in ('metrics', 'credit')}
-    defaults = {name: setting.default for name, setting in config.SETTINGS.items() if name not in content['settings']}
-    return Record({**content['settings'], **defaults}, columns['metrics'], columns['credit'],
+    return Record(_settings(config.from_flat(content['settings'])), columns['metrics'], columns['credit'],
                   {int(steps): facts for steps, facts in content['ends'].items()})

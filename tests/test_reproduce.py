@@ -381,8 +381,12 @@ def test_a_record_of_other_settings_is_not_taken_for_the_run(made_up, tmp_path):
     shutil.rmtree(records.folder)
     assert records.finished(first)
     assert not records.finished(replace(first, settings=config.from_flat({'gamma': 0.9}, first.settings)))
+    assert records.finished(replace(first, settings=config.from_flat({'reward_network.epochs': 3}, first.settings)))  # beta is 0
     shorter = replace(first, settings=config.from_flat({'total_steps': 3200}, first.settings))
     assert records.finished(shorter) and records.facts(shorter) is None and records.metrics(shorter)[STEPS].tolist() == [3200]
+    file, = tmp_path.glob('results/runs/*.json')
+    file.write_text(file.read_text().replace('"gamma"', '"of_old"'))
+    assert not records.finished(first)
 
 
 def test_a_longer_record_stays_when_a_shorter_run_is_trained_again(made_up):
