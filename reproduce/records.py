@@ -136,10 +136,13 @@ class Records:
 
 
 def _settings(settings: Settings) -> dict[str, Any]:
-    """Those that make it another run: plain MAPPO has no reward network, whatever that would be like."""
+    """Those that make it another run: not what a reward network would be like that it does not have."""
     values = config.flatten(config.from_flat(OF_THE_FOLDER_ALONE, settings))
-    without_reward = settings.learner.estimator == 'dae' and settings.learner.beta == 0
-    return {name: value for name, value in values.items() if not (without_reward and name.startswith('reward_network.'))}
+    if settings.learner.estimator == 'dae' and settings.learner.beta == 0:
+        return {name: value for name, value in values.items() if not name.startswith('reward_network.')}
+    if settings.reward_network.architecture == 'per_agent':
+        del values['reward_network.trunk_size']
+    return values
 
 
 def _columns(file: Path) -> dict[str, np.ndarray]:

@@ -18,8 +18,8 @@ from dae_ros.weights.codec import decode_policy, encode_policy, tensors_sha256
 from dae_ros.worlds import make_worlds, world_spec
 
 UPDATES = 5
-SMALL = {'seed': 3, 'learner_threads': 1, 'hidden_size': 8, 'reward_network.hidden_size': 8, 'epochs': 2,
-         'reward_network.epochs': 2, 'chunk_length': 4, 'evaluation_episodes': 10, 'checkpoint_interval': 2}
+SMALL = {'seed': 3, 'learner_threads': 1, 'hidden_size': 8, 'reward_network.hidden_size': 8, 'reward_network.trunk_size': 8,
+         'epochs': 2, 'reward_network.epochs': 2, 'chunk_length': 4, 'evaluation_episodes': 10, 'checkpoint_interval': 2}
 NAVIGATION = {**SMALL, 'task': 'navigation', 'num_agents': 3, 'num_worlds': 4, 'num_steps': 10, 'episode_steps': 5,
               'total_steps': 40 * UPDATES, 'num_mini_batches': 2}
 MATRIX_GAME = {**SMALL, 'task': 'matrix_game', 'num_agents': 4, 'num_worlds': 3, 'num_steps': 8,

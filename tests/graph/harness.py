@@ -37,8 +37,8 @@ ANSWER_TIMEOUT = 10  # s before a service is asked again
 REPOSITORY = Path(__file__).parents[2]
 
 SMALL = {'task': 'navigation', 'num_agents': 3, 'num_worlds': 8, 'num_steps': 25, 'total_steps': 5 * 8 * 25, 'epochs': 2,
-         'reward_network.epochs': 2, 'reward_network.hidden_size': 16, 'hidden_size': 16, 'evaluation_episodes': 8,
-         'rollout_timeout': 20.0}
+         'reward_network.epochs': 2, 'reward_network.hidden_size': 16, 'reward_network.trunk_size': 16, 'hidden_size': 16,
+         'evaluation_episodes': 8, 'rollout_timeout': 20.0}
 """Five updates of navigation with three robots."""
 
 
