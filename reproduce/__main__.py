@@ -60,7 +60,8 @@ def show(chosen: list[Figure], records: Records) -> None:
     """A line for each figure and one for all: how many runs are done, and the core hours left at the speed of those done."""
     everything = [run for figure in chosen for run in figure.all_runs()]
     speed = records.speed(set(everything))
-    for name, runs in [*((f'{figure.name:26}{figure.title}', figure.all_runs()) for figure in chosen), ('all', everything)]:
+    width = max(len(figure.name) for figure in chosen) + 2
+    for name, runs in [*((f'{figure.name:{width}}{figure.title}', figure.all_runs()) for figure in chosen), ('all', everything)]:
         todo = schedule.jobs(runs, records)
         steps = sum(job.run.steps - job.begins_at for job in todo)
         hours = sum(job.work(records.progress(job.run.name)[0]) for job in todo) / speed / 3600
