@@ -66,7 +66,7 @@ class RewardNetworkSettings:
                                                 'paper\'s network, recurrent for each agent',
                                 choices=('shared_trunk', 'per_agent'))
     hidden_size: int = setting(128, 'width of the reward network', unit='units', minimum=1, maximum=4096)
-    trunk_size: int = setting(128, 'width of the recurrent layer of shared_trunk', unit='units', minimum=1, maximum=4096)
+    trunk_size: int = setting(96, 'width of the recurrent layer of shared_trunk', unit='units', minimum=1, maximum=4096)
     recurrent: bool = setting(True, 'the reward network remembers earlier steps of the episode, which delayed rewards depend on')
     ensemble_size: int = setting(1, 'networks averaged: 1 as in the paper, 2 as in its authors\' code', minimum=1, maximum=16)
     learning_rate: float = setting(7e-4, 'step size of the reward network\'s Adam', minimum=0.0, maximum=1.0)
