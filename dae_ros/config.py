@@ -62,9 +62,9 @@ class TaskSettings:
 class RewardNetworkSettings:
     """The learnt reward behind the credit (paper section 3.3), unused at beta = 0; with COMA its action values instead."""
 
-    architecture: str = setting('shared_trunk', 'one recurrent pass per world that tells what each agent\'s action adds, or the '
-                                                'paper\'s network, recurrent for each agent',
-                                choices=('shared_trunk', 'per_agent'))
+    architecture: str = setting('per_agent', 'the paper\'s network, recurrent for each agent, or one recurrent pass per world '
+                                             'that tells what each agent\'s action adds; not for delayed rewards',
+                                choices=('per_agent', 'shared_trunk'))
     hidden_size: int = setting(128, 'width of the reward network', unit='units', minimum=1, maximum=4096)
     trunk_size: int = setting(96, 'width of the recurrent layer of shared_trunk', unit='units', minimum=1, maximum=4096)
     recurrent: bool = setting(True, 'the reward network remembers earlier steps of the episode, which delayed rewards depend on')

@@ -49,7 +49,10 @@ class Record:
 
     def covers(self, run: Run) -> bool:
         """Whether it is of this run, and the run came to its end, or went past it on the way to more steps."""
-        return (run.steps in self.ends or self.steps > run.steps) and self.settings == _settings(run.settings)
+        own, asked = self.settings, _settings(run.settings)
+        if run.exact:
+            own, asked = map(_without_reward_network, (own, asked))
+        return (run.steps in self.ends or self.steps > run.steps) and own == asked
 
 
 class Records:
@@ -139,10 +142,14 @@ def _settings(settings: Settings) -> dict[str, Any]:
     """Those that make it another run: not what a reward network would be like that it does not have."""
     values = config.flatten(config.from_flat(OF_THE_FOLDER_ALONE, settings))
     if settings.learner.estimator == 'dae' and settings.learner.beta == 0:
-        return {name: value for name, value in values.items() if not name.startswith('reward_network.')}
+        return _without_reward_network(values)
     if settings.reward_network.architecture == 'per_agent':
         del values['reward_network.trunk_size']
     return values
+
+
+def _without_reward_network(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if not name.startswith('reward_network.')}
 
 
 def _columns(file: Path) -> dict[str, np.ndarray]:

@@ -161,7 +161,7 @@ def test_a_resumed_run_needs_its_file_no_more(file, tmp_path):
     ({'reward_network.hidden_size': 64}, 'do not fit this run: hidden_size is 32 there and 64 here; train some from bags'),
     ({'reward_network.ensemble_size': 2}, 'members is 1 there and 2 here'),
     ({'reward_network.recurrent': False}, 'recurrent is True there and False here'),
-    ({'reward_network.architecture': 'per_agent'}, "architecture is 'shared_trunk' there and 'per_agent' here"),
+    ({'reward_network.architecture': 'shared_trunk'}, "architecture is 'per_agent' there and 'shared_trunk' here"),
     ({'beta': 0.0}, 'reward_network.path needs the reward network that estimator = dae has at beta above 0'),
     ({'estimator': 'coma'}, 'reward_network.path needs the reward network'),
 ])
