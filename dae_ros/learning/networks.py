@@ -312,9 +312,9 @@ class SharedTrunkRewardNetwork(RewardNetwork):
     adds to the reward there, by itself and together with each other agent's (see `joint_reward`).
 
     It sees more than the paper's, which never shows an agent its own earlier actions: where one of these is paid late, it knows,
-    and leaves it no credit. It learns what one action does whatever the others do, which the paper's has to find out for every a_-i. It learns in units of the deviation of the first
-    rewards from their mean; until it has seen any it predicts 0. Earlier actions count for nothing at first: where a reward
-    does not depend on them, they are so many numbers to be misled by.
+    and leaves it no credit. It learns what one action does whatever the others do, which the paper's has to find out for every
+    a_-i. It learns in units of the deviation of the first rewards from their mean; until it has seen any it predicts 0. Earlier
+    actions count for nothing at first: where a reward does not depend on them, they are so many numbers to be misled by.
     """
 
     head_gain = 0.1
