@@ -116,8 +116,9 @@ class Figure:
             settings = config.from_flat(values)
         except SettingsError as error:
             raise SettingsError(f'curve {curve} of figure {self.name}: {error}') from error
-        # Named after its settings, not after a figure or a curve, so that figures share it.
-        different = ''.join(f'_{name}-{_text(config.flatten(settings)[name])}' for name in sorted(changes))
+        # Named after its settings, not after a figure or a curve, so that figures share it; a file's name has to hold them all.
+        different = ''.join(f'_{name.replace("reward_network", "reward")}-{_text(config.flatten(settings)[name])}'
+                            for name in sorted(changes))
         different += f'_{EXACT}' if exact else f'_{PRETRAINED}-{pretrained}' if pretrained else ''
         return Run(f'{Path(team.task).name}_n{team.num_agents}{different}_seed{seed}', settings, exact,
                    min(pretrained, SHORT_PRETRAINING) if self.short else pretrained)
