@@ -121,7 +121,7 @@ class Records:
         measured = _columns(path / 'credit' / 'metrics.csv')
         credit = {name: measured[name] for name in (STEPS, *CREDIT)} if len(measured[STEPS]) else {}
         ends = {}
-        for file in path.glob(finished_file(path, 0).name.replace('0' * 10, '*')):
+        for file in path.glob('finished_*.json'):
             facts = json.loads(file.read_text(encoding='utf-8'))
             facts.pop('settings')
             ends[facts['environment_steps']] = facts
