@@ -99,7 +99,8 @@ def run_in_two(*arguments):
 
 @pytest.mark.parametrize('changes', [{'beta': 0.0}, {'num_mini_batches': 3, 'reward_network.architecture': 'shared_trunk',
                                                      'reward_network.ensemble_size': 2},
-                                     {'estimator': 'coma', 'reward_network.epochs': 2}, {'reward_network.replay_rollouts': 2}],
+                                     {'estimator': 'coma', 'reward_network.epochs': 2},
+                                     {'reward_network.replay_rollouts': 2, 'reward_network.learns_first': True}],
                          ids=str)
 def test_the_gradients_of_two_processes_are_those_of_one(changes, tmp_path):
     script = tmp_path / 'script.py'

@@ -623,6 +623,25 @@ def test_the_reward_network_learns_a_reward_that_hangs_on_all_actions(architectu
     assert explained[0] < 0.2 and explained[-1] > 0.9
 
 
+@pytest.mark.parametrize('reward_settings', [REWARD, SHARED_TRUNK, REPLAY, replace(REWARD, ensemble_size=2)])
+def test_credit_is_told_before_the_rollout_is_learnt_from_or_if_asked_after(reward_settings, make_learner):
+    trajectory, learnt = random_trajectory(8, 32), []
+    for first in (False, True):
+        learner = make_learner(reward_settings=replace(reward_settings, learns_first=first))
+        learner.watched_world = 3
+        before = learner.expected_rewards(trajectory)
+        metrics = learner.update(trajectory, 0)
+        after = learner.expected_rewards(trajectory)
+        told = trajectory.rewards[:, 3, None] - learner.credit.differences
+        assert not np.allclose(before, after, atol=1e-3)
+        np.testing.assert_allclose(told, (after if first else before)[:, 3], atol=1e-5)
+        learnt.append((parameters(state_of(learner), 'reward_network.0'), metrics['reward_network/explained_variance'],
+                       metrics['reward_network/loss']))
+    (one, *told_of_one), (other, *told_of_other) = learnt
+    assert told_of_one == told_of_other
+    assert all(np.array_equal(one[name], other[name]) for name in one)  # what it learns is the same
+
+
 def test_the_members_of_an_ensemble_are_networks_of_their_own(make_learner):
     learner = make_learner(reward_settings=replace(REWARD, ensemble_size=2))
     for _ in range(2):

@@ -103,7 +103,7 @@ class DifferenceEstimator:
 
     def estimate(self, data: Trajectory, rollout: int) -> Estimate:
         """Advantages (algorithm 1, line 19), and the trainings of critic and reward networks on the rollout."""
-        settings, metrics, trainings = self._settings, {}, []
+        settings, trainings, metrics = self._settings, [], {}
         continues = (~(data.terminated | data.truncated)).float()
 
         # Line 13: values, by the critic as it is before the update, one for the team or one for each agent.
@@ -122,15 +122,7 @@ class DifferenceEstimator:
         if self._exact_rewards is not None:
             expected = torch.from_numpy(self._exact_rewards(data.map(lambda part: part.cpu().numpy()))).to(shared)
         elif self._reward:
-            remembered = as_remembered(data, self._reward_settings)
-            predicted, inputs, states = ensemble_prediction(self._reward, remembered)
-            expected = self._expected(predicted, data)
-            taken = advantages.of_actions(predicted, data.actions)
-            error = advantages.among((taken - data.rewards.unsqueeze(-1)).square(), data.present).mean()
-            metrics['reward_network/explained_variance'] = float(
-                1 - error / data.rewards.var(correction=0).clamp_min(1e-12))
-            if not self._reward_settings.freeze:
-                trainings = self._reward_trainings(remembered, inputs, states, rollout)
+            expected, trainings, metrics = self._learnt_expectations(data, rollout)
         estimated = shared.expand(data.actions.shape)
         if expected is not None:
             estimated = estimated - advantages.credit_baselines(expected, continues, settings.beta, settings.gamma,
@@ -170,6 +162,20 @@ class DifferenceEstimator:
         self._value_norm.load_state(tensors['value_norm'])
         if self._replay:
             self._replay.load_state(tensors)
+
+    def _learnt_expectations(self, data: Trajectory, rollout: int) -> tuple[Tensor, list[Training], dict[str, float]]:
+        """What the reward networks expect [T, W, N], their trainings on the rollout that are still to be run, and metrics."""
+        remembered = as_remembered(data, self._reward_settings)
+        predicted, inputs, states = ensemble_prediction(self._reward, remembered)
+        taken = advantages.of_actions(predicted, data.actions)
+        error = advantages.among((taken - data.rewards.unsqueeze(-1)).square(), data.present).mean()
+        metrics = {'reward_network/explained_variance': float(1 - error / data.rewards.var(correction=0).clamp_min(1e-12))}
+        trainings = [] if self._reward_settings.freeze else self._reward_trainings(remembered, inputs, states, rollout)
+        if trainings and self._reward_settings.learns_first:
+            metrics |= self._passes.run(trainings)
+            trainings = []
+            predicted, _, _ = ensemble_prediction(self._reward, remembered)
+        return self._expected(predicted, data), trainings, metrics
 
     def _expected(self, predicted: Tensor, data: Trajectory) -> Tensor:
         """E over a_i ~ pi_i of what was predicted, [T, W, N]. Of an agent that has left, which had no choice, all that came
