@@ -76,8 +76,8 @@ class RewardNetworkSettings:
                                    unit='rollouts', minimum=0, maximum=100_000)
     replay_steps: int = setting(40, 'gradient steps per update on replayed rollouts', unit='steps', minimum=1, maximum=100_000)
     replay_chunks: int = setting(64, 'chunks drawn for each of these steps', unit='chunks', minimum=1, maximum=1_000_000)
-    learns_first: bool = setting(False, 'learn from a rollout before its credit is told, which then comes sooner, and knows a little '
-                                        'of each agent\'s own action; the authors\' code tells the credit first')
+    learns_first: bool = setting(False, 'learn from a rollout before its credit is told: of use sooner, and biased a little, as '
+                                        'each agent\'s own action is then among what was learnt from')
     path: str = setting('', 'file of train_reward with the reward networks to begin with; empty for untrained ones. A run '
                             'that is resumed no longer reads it')
     freeze: bool = setting(False, 'keep the reward networks as they are in the file that path names')

@@ -75,7 +75,7 @@ def test_every_run_of_every_figure_has_settings(name):
     assert len(runs) == len(set(runs)) and len({run.name for run in runs}) == sum(
         team.seeds for team in figure.teams) * len(figure.curves)
     assert all(run.settings.learner.learner_threads == 1 for run in runs)
-    assert max(len(f'.{run.name}.json.4194304.part') for run in runs) <= 255  # the record while it is written: most a name may have
+    assert max(len(f'.{run.name}.json.4194304.part') for run in runs) <= 255  # bytes of a file's name: a record being written
 
 
 def test_the_declared_sizes_are_those_asked_for():
