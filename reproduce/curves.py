@@ -51,9 +51,9 @@ class Curves:
             for curve in figure.curves:
                 runs = figure.runs(team, curve)
                 width = max(1, runs[0].updates // POINTS) * runs[0].steps_per_update
-                self.seeds[team, curve] = [_seed(run, width, records) for run in runs if records.finished(run)]
+                self.seeds[team, curve] = [self._seed(run, width, records) for run in runs if records.finished(run)]
                 longer = figure.longer_run(team, curve)
-                self.longer[team, curve] = (_seed(longer, width, records)
+                self.longer[team, curve] = (self._seed(longer, width, records)
                                             if longer is not None and records.finished(longer) else None)
 
     def counts(self, teams: list[Team], curve: str) -> list[int]:
@@ -93,19 +93,20 @@ class Curves:
                                      *(f'{number:.5g}' if np.isfinite(number) else '' for number in numbers)])
         write_atomically(path, text.getvalue().encode())
 
-
-def _seed(run: Run, width: int, records: Records) -> Seed:
-    columns = records.metrics(run)
-    steps = columns[STEPS]
-    missing = np.full(len(steps), np.nan)  # a run without reward networks has no metrics of them
-    metrics = {metric: binned(steps, columns.get(metric, missing), width) for metric in COLUMNS}
-    ends = np.arange(1, len(metrics['mean_return']) + 1) * min(width, int(steps[-1]))
-    # The usual time of an update: what else the machine did now and then must not move the curve.
-    metrics[SECONDS] = ends / run.steps_per_update * np.median(columns[SECONDS])
-    credit = records.credit(run)
-    for metric, name in PROBED.items():
-        if run.exact:
-            metrics[metric] = np.ones(len(ends))
-        elif credit:
-            metrics[metric] = np.interp(ends, credit[STEPS], credit[name])
-    return Seed(run, ends, metrics)
+    def _seed(self, run: Run, width: int, records: Records) -> Seed:
+        """Its run, in bins of `width` environment steps."""
+        columns = records.metrics(run)
+        steps = columns[STEPS]
+        missing = np.full(len(steps), np.nan)  # a run without reward networks has no metrics of them
+        metrics = {metric: binned(steps, columns.get(metric, missing), width) for metric in COLUMNS}
+        ends = np.arange(1, len(metrics['mean_return']) + 1) * min(width, int(steps[-1]))
+        # The usual time of an update: what else the machine did now and then must not move the curve.
+        metrics[SECONDS] = ends / run.steps_per_update * np.median(columns[SECONDS])
+        credit = records.credit(run)
+        for metric, name in PROBED.items():
+            if run.exact:
+                metrics[metric] = np.ones(len(ends))
+            elif credit:
+                metrics[metric] = np.interp(ends, credit[STEPS], credit[name], left=np.nan)
+        shown = ends <= max(self.figure.until or np.inf, ends[0])
+        return Seed(run, ends[shown], {metric: values[shown] for metric, values in metrics.items()})

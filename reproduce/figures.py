@@ -84,6 +84,7 @@ class Figure:
     average: bool                        # over the team sizes of a task
     threshold: float | None
     baseline: str | None
+    until: int | None                    # environment steps after which it shows no more of its runs
     palette: tuple[str, ...]             # all curves of the file, so that a curve has one colour in all its figures
     short: bool
 
@@ -181,7 +182,7 @@ def _figures_of(path: Path) -> list[Figure]:
     for name, declared in content['figures'].items():
         origin = f'figure {name} in {path}'
         parts = _fields(_mapping(declared, origin), origin, {'title': str, 'shows': str, 'curves': list},
-                        {'against': str, 'average': bool, 'threshold': float, 'baseline': str})
+                        {'against': str, 'average': bool, 'threshold': float, 'baseline': str, 'until': int})
         for curve in parts['curves']:
             if curve not in curves:
                 raise SettingsError(f'{origin} names the curve {curve!r}, which is not under curves')
@@ -189,13 +190,15 @@ def _figures_of(path: Path) -> list[Figure]:
             raise SettingsError(f'{origin} has the baseline {parts["baseline"]!r}, which is none of its curves')
         if parts['threshold'] is not None and parts['baseline'] is None:
             raise SettingsError(f'{origin} has a threshold and no baseline to be sooner than')
+        if parts['until'] is not None and parts['until'] < 1:
+            raise SettingsError(f'{origin} must show at least one step, not until {parts["until"]}')
         against = parts['against'] or STEPS
         for metric in (parts['shows'], against):
             if metric not in METRICS:
                 raise SettingsError(f'{origin} cannot show {metric!r}; known are {", ".join(METRICS)}')
         figures.append(Figure(str(name), parts['title'], parts['shows'], {curve: curves[curve] for curve in parts['curves']},
-                              teams, against, bool(parts['average']), parts['threshold'], parts['baseline'], tuple(curves),
-                              short=False))
+                              teams, against, bool(parts['average']), parts['threshold'], parts['baseline'], parts['until'],
+                              tuple(curves), short=False))
     return figures
 
 

@@ -86,9 +86,10 @@ def _results(curves: Curves, records: Records) -> str:
 
 def _row(curves: Curves, records: Records, task: str, teams: Sequence[Team], curve: str, groups: Sequence[Sequence[Seed]],
          seeds: str) -> list[str]:
-    """One curve's numbers at the end of training, over the seeds of each team."""
-    return [task, _sizes(teams), curve, seeds, f'{groups[0][0].run.steps:,}',
-            _number(*_interval(groups, lambda seed: last(seed.metrics[curves.figure.shows]))),
+    """One curve's numbers at the end of training, or of what is shown of it, over the seeds of each team."""
+    figure = curves.figure
+    return [task, _sizes(teams), curve, seeds, f'{min(groups[0][0].run.steps, figure.until or np.inf):,}',
+            _number(*_interval(groups, lambda seed: last(seed.metrics[figure.shows]))),
             _number(*_interval(groups, lambda seed: _evaluation(seed, records, _evaluated(curves)[1])))]
 
 

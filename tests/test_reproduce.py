@@ -101,6 +101,7 @@ def test_options_replace_seeds_and_steps():
     ('baseline: low', 'baseline: lowest', "has the baseline 'lowest'"),
     ('baseline: low, ', '', 'has a threshold and no baseline'),
     ('threshold: 5', 'threshold: five', "threshold must be of type float, not 'five'"),
+    ('threshold: 5', 'threshold: 5, until: 0', 'must show at least one step, not until 0'),
     ('seeds: 3', 'seeds: 0', 'must be integers of at least 1'),
     ('{3: {seeds: 3, steps: 6400}}', '5', 'teams of line .* must be a mapping, not 5'),
     ('{beta: 1.0}', '{betta: 1.0}', "curve high of figure x: unknown setting 'betta'; did you mean 'beta'"),
@@ -318,6 +319,26 @@ def test_tables_hold_means_intervals_and_paired_differences(made_up):
     assert '| navigation | 3, 4 | high − low | 2 + 2 | 3.00 ± 0.00 |' in block
     assert '| line | 3 | high | 2 of 3 | 3,200 | ' in block and 'not within 6,400' in block
     assert '`evaluation_episodes`' not in block and '`beta` 1.0' in block and 'abacus, 2 cores, wood' in block
+
+
+def test_a_figure_can_end_before_its_runs(made_up):
+    figure, records = made_up
+    whole, part = Curves(figure, records), Curves(replace(figure, until=figure.teams[-1].steps // 2), records)
+    for key, seeds in part.seeds.items():
+        for seed, entire in zip(seeds, whole.seeds[key], strict=True):
+            assert 0 < len(seed.steps) < len(entire.steps) and seed.steps[-1] <= figure.teams[-1].steps // 2
+            assert np.array_equal(seed.metrics['mean_return'], entire.metrics['mean_return'][:len(seed.steps)])
+    assert '| line | 3 | low | 2 of 3 | 3,200 | 3.50 ± ' in figure_block(part, records)
+
+
+def test_nothing_is_told_of_the_credit_before_it_was_first_measured(made_up):
+    figure, records = made_up
+    each = figure.runs(figure.teams[0], 'high')[0]
+    log = MetricsLog(records.path(each) / 'credit')
+    log.write(each.steps, {'explained': 0.75, 'credit_explained': 0.5})
+    log.close()
+    told = Curves(figure, records).seeds[figure.teams[0], 'high'][0].metrics['expected_reward/explained']
+    assert np.isnan(told[:-1]).all() and told[-1] == 0.75
 
 
 def test_an_average_leaves_out_a_team_size_that_a_curve_lacks(made_up):
