@@ -46,8 +46,8 @@ def draw(curves: Curves, path: Path) -> None:
         handles |= {text: line for line, text in zip(*axes.get_legend_handles_labels())}
     if handles:
         order = [curve for curve in figure.curves if curve in handles]
-        canvas.legend([handles[curve] for curve in order], order, ncols=len(order) if len(order) < 5 else 3, loc='outside upper center', fontsize=9,
-                      frameon=False)
+        canvas.legend([handles[curve] for curve in order], order, ncols=len(order) if len(order) < 5 else 3,
+                      loc='outside upper center', fontsize=9, frameon=False)
     canvas.savefig(path, dpi=150, format='png')
 
 
