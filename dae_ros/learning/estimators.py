@@ -173,8 +173,7 @@ class DifferenceEstimator:
         trainings = [] if self._reward_settings.freeze else self._reward_trainings(remembered, inputs, states, rollout)
         if trainings and self._reward_settings.learns_first:
             metrics |= self._passes.run(trainings)
-            trainings = []
-            predicted, _, _ = ensemble_prediction(self._reward, remembered)
+            return self.expected_rewards(data), [], metrics
         return self._expected(predicted, data), trainings, metrics
 
     def _expected(self, predicted: Tensor, data: Trajectory) -> Tensor:
