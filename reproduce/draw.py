@@ -66,11 +66,11 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     if not counts:
         axes.set(xticks=[], yticks=[])
         return
-    if figure.shows == 'mean_return':
-        _yardsticks(axes, curves, teams)
-    if figure.scattered:
+    if figure.scattered:  # without yardsticks: they would press the points into a line
         _points(axes, curves, teams)
         return
+    if figure.shows == 'mean_return':
+        _yardsticks(axes, curves, teams)
     bands = {curve: band for curve in figure.curves if (band := curves.band(teams, curve, figure.shows)) is not None}
     for curve, band in bands.items():
         colour = _colour(curves, curve)
