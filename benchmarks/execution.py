@@ -28,6 +28,7 @@ def measure() -> dict[str, float]:
     from rclpy.executors import SingleThreadedExecutor
 
     from dae_ros.ros import convert, names, qos
+    from dae_ros.ros.farewell import leave
     from dae_ros.ros.graph import node_environment
     from dae_ros.types import Observation, Stamp
 
@@ -70,6 +71,7 @@ def measure() -> dict[str, float]:
         agent.terminate()
         agent.wait()
         executor.shutdown()
+        leave([node])
         rclpy.try_shutdown()
     return {'median': float(said['answer time, median [ms]']), 'percentile_99': float(said['answer time, 99th percentile [ms]']),
             'round_trip_median': 1e3 * float(np.median(taken)), 'round_trip_percentile_99': 1e3 * float(np.percentile(taken, 99))}

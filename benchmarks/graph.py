@@ -33,6 +33,7 @@ from dae_ros import config
 from dae_ros.config import Settings
 from dae_ros.report.metrics import STEPS, read_metrics
 from dae_ros.ros import names, qos
+from dae_ros.ros.farewell import leave
 from dae_ros.ros.graph import NodeProcess, node_environment, training_graph
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
@@ -116,6 +117,7 @@ def run_graph(settings: Settings, path: Path, updates: int, bag: Path | None = N
         expect(lambda: newest >= updates)
     finally:
         supervisor.stop()
+        leave([node])
         rclpy.try_shutdown()
     return {name: seconds / rollouts / settings.run.num_steps for name, seconds in used.items()}
 

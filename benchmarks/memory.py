@@ -25,6 +25,7 @@ from dae_ros_msgs.msg import TrainingStatus
 from rclpy.executors import SingleThreadedExecutor
 
 from dae_ros.ros import names, qos
+from dae_ros.ros.farewell import leave
 from dae_ros.ros.graph import node_environment
 
 EVERY, WARM_UP = 100, 200  # updates
@@ -83,6 +84,7 @@ def measure(updates: int = 2200, robots: int = 4) -> dict[str, Any]:
         finally:
             bringup.send_signal(signal.SIGINT)
             bringup.wait()
+            leave([node])
             rclpy.try_shutdown()
     rows = {name: [reading[name] for reading in readings.values()] for name in readings[WARM_UP]}
     own = {name: [reading.own for reading in row] for name, row in rows.items()}

@@ -33,6 +33,7 @@ from dae_ros.errors import DaeRosError, Refused, SettingsError
 from dae_ros.robots.standard_messages import seconds
 from dae_ros.ros import names, params, qos, transport
 from dae_ros.ros.clock_watch import ClockWatch
+from dae_ros.ros.farewell import leave
 
 try:
     from rclpy.experimental import EventsExecutor as Executor
@@ -259,7 +260,7 @@ def settings_of_process(name: str, declared: Iterable[SettingInfo]) -> dict[str,
     try:
         return params.declare(reader, declared)
     finally:
-        reader.destroy_node()
+        leave([reader])
 
 
 def run(make_node: Callable[[], TeamNode], args: list[str] | None = None) -> int:
@@ -317,12 +318,12 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
                 watch.close()
             if executor is not None:
                 executor.shutdown()
-            for node in nodes:
-                try:
+            try:
+                for node in nodes:
                     node.close()
-                finally:
-                    node.destroy_node()
-            rclpy.try_shutdown()
+            finally:
+                leave(nodes)
+                rclpy.try_shutdown()
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except (DaeRosError, OSError) as error:

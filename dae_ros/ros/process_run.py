@@ -19,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from dae_ros.errors import DaeRosError
 from dae_ros.restarts import Restarts, describe
 from dae_ros.ros import transport
+from dae_ros.ros.farewell import leave
 from dae_ros.ros.graph import NodeProcess, enclave_arguments, node_environment
 from dae_ros.ros.supervisor import Supervisor
 
@@ -78,6 +79,7 @@ class ProcessRun:
             rclpy.try_shutdown()
             if spinning.ident is not None:
                 spinning.join()
+            leave([node])
 
     def _listen(self, node: Node) -> None:
         """Makes the subscriptions that are needed; their callbacks go through `_later`."""

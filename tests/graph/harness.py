@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,12 +20,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import Trigger
 
 from dae_ros import config
+from dae_ros.errors import Refused
 from dae_ros.learning.native import build
 from dae_ros.learning.networks import make_reward_network
 from dae_ros.learning.reward_files import encode
 from dae_ros.report.summary import Summary
 from dae_ros.rollout.in_process import train
 from dae_ros.ros import names, qos
+from dae_ros.ros.farewell import leave
 from dae_ros.ros.graph import NodeProcess, training_graph
 from dae_ros.ros.node import Executor, look_for_overlooked
 from dae_ros.ros.supervisor import Supervisor
@@ -79,6 +82,12 @@ class Graph:
 
     def log(self, name: str) -> str:
         return self._supervisor.log_file(name).read_text()
+
+    def refused(self) -> set[str]:
+        """Why nodes that were started refused messages. That one came late or again does not count: a rollout may be begun anew
+        while nodes are still finding each other."""
+        said = ''.join(self.log(name) for name in self.pids)
+        return set(re.findall(r'refused a message on \S+: (\w+): ', said)) - {Refused.STALE, Refused.DUPLICATE}
 
     def stop(self) -> None:
         self._supervisor.stop()
@@ -165,7 +174,7 @@ class Listener:
 
     def __exit__(self, *_) -> None:
         self.executor.shutdown()
-        self.node.destroy_node()
+        leave([self.node])
         self.context.try_shutdown()
 
     def spin_until(self, condition: Callable[[], bool], missing: Callable[[], str] = lambda: 'waited in vain') -> None:

@@ -123,17 +123,22 @@ class Stage(Listener):
         return self.commands[robot][-1]
 
     def step(self, robots: Iterable[int], *shown: int) -> None:
-        """A tick in which these robots act. One that passes it over, since it was too busy, has to act in a later one."""
+        """A tick in which these robots act, on observations that were heard here too. One that passes it over, since it was too
+        busy, has to act in a later one."""
         counts = {robot: len(self.actions[robot]) for robot in robots}
         deadline = time.monotonic() + TIMEOUT
 
         def have_acted() -> bool:
-            return all(len(self.actions[robot]) > count for robot, count in counts.items())
+            return all(len(self.actions[robot]) > count and self.has_heard_both(robot) for robot, count in counts.items())
 
         while not have_acted():
             assert time.monotonic() < deadline, {name: said[-1] for name, said in self.diagnostics.items()}
             self.tick(*shown)
             self._holds_within(PATIENCE, have_acted)
+
+    def has_heard_both(self, robot: int) -> bool:
+        """Whether the robot's newest action and the observation it answers are here."""
+        return self.actions[robot][-1].stamp == self.observations[robot][-1].stamp
 
     def tick_until(self, condition: Callable[[], bool], *shown: int) -> None:
         """Lets the clock go on, ten times as fast as at most, until `condition` holds; AssertionError if it never does."""

@@ -31,6 +31,7 @@ from dae_ros.weights.codec import decode_policy
 
 LAYOUTS, NEEDED = 20, 16
 BURST, EPISODE = 100, 25
+WATCHED = 2 * EPISODE  # steps, among which an episode begins
 SECONDS = 8.0   # of simulated time for each layout
 SPEEDUP = 3.0
 CLOSE = 0.25    # m, mean distance of the landmarks to the nearest robot
@@ -63,6 +64,14 @@ def answers_of(policy, observations, run=1):
     return [end.on_observation(observation).actions[0] for observation in observations]
 
 
+def check_last_answers(stage, robot, policy):
+    """What this robot did in its last `WATCHED` steps is what this policy answers, from where an episode begins among them."""
+    acted, seen = stage.decoded(stage.actions[robot])[-WATCHED:], stage.decoded(stage.observations[robot])
+    acted = acted[next(index for index, action in enumerate(acted) if action.stamp.step == 0):]
+    by_stamp = {observation.stamp: observation for observation in seen}
+    assert [action.actions[0] for action in acted] == answers_of(policy, [by_stamp[action.stamp] for action in acted])
+
+
 def test_a_robot_stands_until_it_is_enabled_drives_alone_among_strangers_and_stands_when_its_odometry_is_cut(stage, processes):
     """Robots 1 and 2 are somebody else's: nothing but their odometry is there."""
     start_robot(processes, 0, enabled='false')
@@ -73,16 +82,14 @@ def test_a_robot_stands_until_it_is_enabled_drives_alone_among_strangers_and_sta
     assert not stage.observations[0] and all(is_standing(command) for command in stage.commands[0])
     assert stage.call(SetBool, 'bridge_0/enable', SetBool.Request(data=True)).success
     stage.start_driving(0, 0, 1, 2)
-    policy = decode_policy(POLICY.read_bytes())
-    for _ in range(5):
+    for _ in range(WATCHED):
         stage.drive(0, 0, 1, 2)
+    stage.spin_until(lambda: stage.has_heard_both(0))
     seen = stage.decoded(stage.observations[0])
     np.testing.assert_allclose(seen[-1].values[0, 2:4], PLACES[0])
     np.testing.assert_allclose(seen[-1].values[0, 4:10].reshape(3, 2), LANDMARKS - PLACES[0], atol=1e-6)
     np.testing.assert_allclose(seen[-1].values[0, 10:14].reshape(2, 2), PLACES[1:] - PLACES[0], atol=1e-6)
-    acted = stage.decoded(stage.actions[0])
-    by_stamp = {observation.stamp: observation for observation in seen}
-    assert [action.actions[0] for action in acted] == answers_of(policy, [by_stamp[action.stamp] for action in acted])
+    check_last_answers(stage, 0, decode_policy(POLICY.read_bytes()))
 
     stage.drive(0, 1, 2)                                # 0.1 s old: within the bound
     assert is_standing(stage.drive(0, 1, 2))            # the second control period
@@ -128,15 +135,11 @@ def test_robots_of_one_process_are_driven_and_stopped_each_by_itself(stage, proc
     everybody = 0, 1, 2
     for robot in everybody:
         stage.start_driving(robot, *everybody)
-    for _ in range(EPISODE):
+    for _ in range(WATCHED):
         stage.step(everybody, *everybody)
     policy = decode_policy(POLICY.read_bytes())
     for robot in everybody:
-        stage.spin_until(lambda: stage.observations[robot][-1].stamp == stage.actions[robot][-1].stamp)
-        acted, seen = (stage.decoded(heard[robot])[-EPISODE:] for heard in (stage.actions, stage.observations))
-        assert [action.stamp for action in acted] == [observation.stamp for observation in seen]
-        episode = next(index for index, observation in enumerate(seen) if observation.stamp.step == 0)
-        assert [action.actions[0] for action in acted[episode:]] == answers_of(policy, seen[episode:])
+        check_last_answers(stage, robot, policy)
 
     assert stage.call(SetBool, 'bridge_2/enable', SetBool.Request(data=False)).message == 'standing: not enabled'
     stage.spin_until(lambda: is_standing(stage.commands[2][-1]))
@@ -163,13 +166,12 @@ def test_what_robots_do_does_not_change_when_trainer_and_parameter_server_are_ki
     for robot in everybody:
         stage.start_driving(robot, *everybody)
     graph.kill('trainer', 'parameter_server')
-    for _ in range(40):  # more than an episode
+    for _ in range(WATCHED):
         stage.step(everybody, *everybody)
     policy, = (decode_policy(path.read_bytes()) for path in graph.folder.policies.glob('*/policy_*.safetensors'))
     for robot in everybody:
-        acted, seen = stage.decoded(stage.actions[robot]), {item.stamp: item for item in stage.decoded(stage.observations[robot])}
-        assert [action.actions[0] for action in acted] == answers_of(policy, [seen[action.stamp] for action in acted])
-        assert {action.policy_version for action in acted} == {0}
+        check_last_answers(stage, robot, policy)
+        assert {action.policy_version for action in stage.decoded(stage.actions[robot])} == {0}
     assert stage.call(Trigger, 'agent_0/activate_policy', Trigger.Request()).message == 'acting with policy version 0'
 
 
