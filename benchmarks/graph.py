@@ -29,7 +29,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import Trigger
 
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.config import Settings
 from dae_ros.report.metrics import STEPS, read_metrics
 from dae_ros.ros import names, qos
@@ -126,7 +126,7 @@ def run_single_process(settings: Settings, path: Path) -> None:
     """The same training in one process."""
     path.mkdir()
     task_file = path / 'task.yaml'
-    task_file.write_text(config.to_yaml(settings))
+    task_file.write_text(settings_yaml.dump(settings))
     subprocess.run([sys.executable, '-m', 'dae_ros_nodes.bringup', str(task_file), '--in-process', '--run-folder',
                     str(path / 'run')], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 

@@ -18,7 +18,7 @@ from unittest.mock import patch
 
 import dae_ros_nodes  # noqa: F401  sets the threads of the numerical libraries, as for the nodes
 
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.config import Settings
 from dae_ros.learning import networks
 from dae_ros.learning.learner import Learner
@@ -96,7 +96,7 @@ def main() -> None:
     parser.add_argument('settings', nargs='*', metavar='name:=value')
     parser.add_argument('--rollouts', type=int, default=ROLLOUTS)
     options = parser.parse_args()
-    settings = config.from_flat(dict(map(config.parse_override, options.settings)))
+    settings = config.from_flat(dict(map(settings_yaml.parse_override, options.settings)))
     for phase, figure in measure(settings, options.rollouts).items():
         print(f'{phase:18}{figure:12,.1f}')
 

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO, Mapping
 
 import numpy as np
 
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.config import Settings
 from dae_ros.errors import Refused, RunFolderError
 from dae_ros.files import hold, remove_unfinished, write_atomically
@@ -33,7 +33,7 @@ class RunFolder:
         self.run = _identity(settings, path)
         self._keep = settings.run.keep_checkpoints
         self._keep_every = settings.run.keep_every
-        text = config.to_yaml(settings)
+        text = settings_yaml.dump(settings)
         try:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
             if self.settings_file.exists():

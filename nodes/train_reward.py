@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.command import run_command
 from dae_ros.config import (
     SETTINGS,
@@ -62,7 +62,7 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
 
 def read_settings(arguments: argparse.Namespace) -> tuple[config.Settings, RewardTrainingSettings]:
     """The settings with the overrides put in. Raises SettingsError."""
-    values = dict(config.parse_override(text) for text in arguments.parameter)
+    values = dict(settings_yaml.parse_override(text) for text in arguments.parameter)
     known = {**KNOWN, **ROBOTS} if arguments.robots else KNOWN
     for name in values:
         if name not in known:
@@ -75,14 +75,14 @@ def read_bags(arguments: argparse.Namespace) -> Dataset | RobotDataset:
     """The bags: ours, or those of robots. Raises BagError and SettingsError."""
     if not arguments.robots:
         return Dataset(*arguments.bag)
-    of_robots = [text for text in arguments.parameter if config.parse_override(text)[0] not in KNOWN]
+    of_robots = [text for text in arguments.parameter if settings_yaml.parse_override(text)[0] not in KNOWN]
     values = {name: info.default for name, info in ROBOTS.items()}
     return RobotDataset(*arguments.bag, settings={**values, **read_values(arguments.robots, of_robots)})
 
 
 def read_task(path: Path) -> TaskSettings:
     """The task that a file of settings names. Raises SettingsError."""
-    return config.from_flat(config.load_task_file(path)).task
+    return config.from_flat(settings_yaml.load(path)).task
 
 
 def train(dataset: Dataset | RobotDataset, arguments: argparse.Namespace, console: Console) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Mapping
 import yaml
 
 from benchmarks.machine import ROOT
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.config import Settings
 from dae_ros.errors import SettingsError
 from dae_ros.report.metrics import STEPS
@@ -166,7 +166,7 @@ def _resized(figure: Figure, seeds: int | None, steps: int | None, short: bool) 
 
 @lru_cache(maxsize=None)
 def _task_file(task: str) -> dict[str, Any]:
-    return config.load_task_file(ROOT / 'config' / f'{task}.yaml')
+    return settings_yaml.load(ROOT / 'config' / f'{task}.yaml')
 
 
 def _text(value: Any) -> str:

@@ -14,7 +14,7 @@ from typing import Any, Iterable, Mapping
 
 import numpy as np
 
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.config import Settings
 from dae_ros.errors import SettingsError
 from dae_ros.files import write_atomically
@@ -125,7 +125,7 @@ class Records:
             facts = json.loads(file.read_text(encoding='utf-8'))
             facts.pop('settings')
             ends[facts['environment_steps']] = facts
-        return Record(_settings(config.from_flat(config.load_task_file(path / 'settings.yaml'))), metrics, credit, ends)
+        return Record(_settings(config.from_flat(settings_yaml.load(path / 'settings.yaml'))), metrics, credit, ends)
 
     def _file(self, run: Run) -> Path:
         return self._kept / f'{run.name}.json'

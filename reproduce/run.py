@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from benchmarks.machine import description
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.config import Settings
 from dae_ros.credit_probe import AlternativesRecorder, accuracy, probe
 from dae_ros.errors import DaeRosError, RunFolderError
@@ -121,8 +121,8 @@ def _adopt(path: Path, settings: Settings) -> None:
     """Lets a run go on that was begun for fewer steps, or before a setting was declared that has its default here: nothing a
     run does depends on how long it is to be."""
     file = path / 'settings.yaml'
-    if file.exists() and _but_for_length(config.from_flat(config.load_task_file(file))) == _but_for_length(settings):
-        write_atomically(file, config.to_yaml(settings).encode())
+    if file.exists() and _but_for_length(config.from_flat(settings_yaml.load(file))) == _but_for_length(settings):
+        write_atomically(file, settings_yaml.dump(settings).encode())
 
 
 def _but_for_length(settings: Settings) -> Settings:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import select
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Sequence
+from typing import Iterable, Sequence
 
 from benchmarks.machine import ROOT
 from dae_ros import config
@@ -17,7 +19,7 @@ from reproduce.figures import EXACT, PRETRAINED, Run
 from reproduce.progress import Progress
 from reproduce.records import Records
 
-POLL_PERIOD = 1.0    # s
+SHOW_PERIOD = 1.0    # s between looks at how far runs are
 STOP_TIMEOUT = 60.0  # s a run gets to write its checkpoint
 LOG_TAIL = 8         # lines of a failed run's log that are shown
 
@@ -58,7 +60,7 @@ def train(todo: Sequence[Job], workers: int, records: Records, progress: Progres
         while waiting or running:
             while len(running) < workers and (job := _next(waiting, running)) is not None:
                 running[job] = _start(job.run, records)
-            time.sleep(POLL_PERIOD)
+            _wait_for_an_end(running.values(), SHOW_PERIOD)
             for job, process in list(running.items()):
                 if process.poll() is None:
                     continue
@@ -95,7 +97,17 @@ def _start(run: Run, records: Records) -> subprocess.Popen:
         return subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
 
 
-def _stop(processes) -> None:
+def _wait_for_an_end(processes: Iterable[subprocess.Popen], seconds: float) -> None:
+    """Returns when one of the processes has ended, or after so many seconds."""
+    ends = [os.pidfd_open(process.pid) for process in processes]
+    try:
+        select.select(ends, [], [], seconds)
+    finally:
+        for end in ends:
+            os.close(end)
+
+
+def _stop(processes: Iterable[subprocess.Popen]) -> None:
     processes = list(processes)
     for process in processes:
         process.send_signal(signal.SIGTERM)

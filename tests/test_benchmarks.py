@@ -17,7 +17,7 @@ from benchmarks.peers.contender import Block, Contender, ContenderFailed, Runnin
 from benchmarks.peers.match import Comparison, Match
 from benchmarks.peers.outcome import Row, disturbance, outcome
 from benchmarks.peers.plot import plot
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.replay.played import write_rollouts
 
 
@@ -123,7 +123,7 @@ def test_every_contender_has_a_driver_and_our_settings_exist(tmp_path):
         assert (contender.DRIVERS / one.driver).is_file()
         assert not one.environment or (environments.LISTS / f'{one.environment}.txt').is_file()
         if one.driver == 'train_ours.py':
-            config.from_flat(dict(map(config.parse_override, one.arguments)))
+            config.from_flat(dict(map(settings_yaml.parse_override, one.arguments)))
     for each in matches:
         names = {one.name for one in each.contenders}
         assert all({comparison.ours, *comparison.others} <= names for comparison in each.comparisons)

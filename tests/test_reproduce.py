@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.errors import RunFolderError, SettingsError
 from dae_ros.report.metrics import STEPS, MetricsLog
 from dae_ros.run_folder import RunFolder
@@ -184,7 +184,7 @@ def test_a_run_may_begin_with_reward_networks_that_learnt_from_a_bag_of_its_own_
     run.run(tmp_path / 'other', settings(total_steps=32, num_worlds=8, seed=2), never, pretrained=80)
     other, = set(tmp_path.glob('pretrained/*/reward.safetensors')) - {file}
     assert file.read_bytes() == before != other.read_bytes()
-    learnt = {name: RunFolder(tmp_path / name, config.from_flat(config.load_task_file(tmp_path / name / 'settings.yaml')))
+    learnt = {name: RunFolder(tmp_path / name, config.from_flat(settings_yaml.load(tmp_path / name / 'settings.yaml')))
               .newest_checkpoint()[0] for name in ('run', 'frozen')}
     for name, tensor in decode_reward_network(before)[0].items():
         member, _, parameter = name.partition('.')
@@ -212,7 +212,6 @@ def pretending(monkeypatch):
             with open(records.log_file(run), 'w') as log:
                 return subprocess.Popen(['bash', '-c', command(run, records)], stdout=log, stderr=log)
         monkeypatch.setattr(schedule, '_start', start)
-        monkeypatch.setattr(schedule, 'POLL_PERIOD', 0.02)
     return pretend
 
 
@@ -228,14 +227,15 @@ def test_a_failed_run_is_told_of_and_the_others_go_on(tmp_path, pretending, caps
 
 
 def test_an_interruption_stops_the_processes(tmp_path, pretending):
-    pretending(lambda run, records: f'trap "touch {records.path(run)}/stopped; exit" TERM; while true; do sleep 0.02; done')
+    pretending(lambda run, records: f'cd {records.path(run)}; trap "touch stopped; exit" TERM; touch begun; '
+                                    'while true; do sleep 0.02; done')
     runs = [Run(f'run{seed}', settings(total_steps=8, seed=seed)) for seed in (1, 2, 3)]
     records = Records(tmp_path, tmp_path)
 
     class Interrupting(Progress):
         def update(self, waiting, running, records):
-            time.sleep(0.5)
-            raise KeyboardInterrupt
+            if all((records.path(job.run) / 'begun').exists() for job in running):
+                raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt), Interrupting() as progress:
         schedule.train(schedule.jobs(runs, records), 2, records, progress, never)
@@ -287,7 +287,7 @@ def pretend_run(run, records, level):
     """Leaves what a training leaves; returns a shell command that does nothing more."""
     path = records.path(run)
     log = MetricsLog(path)
-    (path / 'settings.yaml').write_text(config.to_yaml(run.settings))
+    (path / 'settings.yaml').write_text(settings_yaml.dump(run.settings))
     for update in range(1, run.updates + 1):
         log.write(update * run.steps_per_update, {'mean_return': level + update, 'advantage/deviation': 1.0,
                                                   'seconds/collecting': 0.5, 'seconds/learning': 1.5})

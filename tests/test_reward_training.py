@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dae_ros_nodes import train_reward
 
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.config import RewardTrainingSettings
 from dae_ros.credit_probe import AlternativesRecorder, recorded_expected_rewards
 from dae_ros.errors import BagError, Refused, SettingsError
@@ -201,14 +201,14 @@ def test_where_the_task_is_known_the_report_tells_the_error_of_the_expected_rewa
     for rollout in range(8):
         seen += team.play(rollout)[1]
     bag = write_bag(tmp_path / 'bag', seen)
-    (tmp_path / 'task.yaml').write_text(config.to_yaml(team.settings))
+    (tmp_path / 'task.yaml').write_text(settings_yaml.dump(team.settings))
     command = ['--bag', str(bag), '--output', str(tmp_path / 'reward.safetensors'), '-p', 'reward_network.hidden_size:=16',
                '-p', 'max_epochs:=2', '-p', 'held_out:=0.2', '--task', str(tmp_path / 'task.yaml')]
     assert train_reward.main(command) == 0
     assert 'of its variance and' in capsys.readouterr().out
     report = json.loads((tmp_path / 'reward/report.json').read_text())
     assert report['expected_reward']['error'] > 0 and (tmp_path / 'reward/report.png').exists()
-    (tmp_path / 'task.yaml').write_text(config.to_yaml(config.from_flat({'task': 'formation'}, team.settings)))
+    (tmp_path / 'task.yaml').write_text(settings_yaml.dump(config.from_flat({'task': 'formation'}, team.settings)))
     assert train_reward.main(command) == 2
     assert 'was not played in this task' in capsys.readouterr().err
 

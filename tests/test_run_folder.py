@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.config import Settings
 from dae_ros.errors import FileError, RunFolderError
 from dae_ros.run_folder import RunFolder
@@ -43,7 +43,7 @@ def checkpoint_of(folder, update):
 
 def test_a_run_leaves_its_settings_as_a_task_file(tmp_path):
     folder = RunFolder(tmp_path / 'runs' / 'mine', SETTINGS)
-    assert config.from_flat(config.load_task_file(folder.settings_file)) == SETTINGS
+    assert config.from_flat(settings_yaml.load(folder.settings_file)) == SETTINGS
 
 
 def test_everything_a_run_leaves_lies_in_its_folder(tmp_path):

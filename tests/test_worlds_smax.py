@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dae_ros import config, draws
+from dae_ros import config, draws, settings_yaml
 from dae_ros.config import TaskSettings
 from dae_ros.errors import SettingsError, WorldError
 from dae_ros.rollout.in_process import InProcessCollector
@@ -20,7 +20,7 @@ W = 3
 
 @pytest.mark.parametrize('path', sorted(MAPS.glob('*.yaml')), ids=lambda path: path.stem)
 def test_the_maps_of_the_paper_have_their_settings(path):
-    settings = config.from_flat(config.load_task_file(path))
+    settings = config.from_flat(settings_yaml.load(path))
     assert settings.task.task.split(':')[1] == path.stem
     assert (settings.task.num_worlds, settings.run.num_steps, settings.learner.learning_rate) == (8, 400, 5e-4)
     epochs = {1_000_000: 15, 5_000_000: 10, 10_000_000: 5}[settings.run.total_steps]

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any, Iterable, NamedTuple
 
-from dae_ros import config
+from dae_ros import config, settings_yaml
 from dae_ros.config import ROBOT_SETTINGS, SETTINGS, Settings
 from dae_ros.errors import SettingsError
 from dae_ros.ros import names
@@ -137,8 +137,8 @@ def read_settings(task_file: Path | None, overrides: Iterable[str]) -> Settings:
 
 def read_values(task_file: Path | None, overrides: Iterable[str]) -> dict[str, Any]:
     """What the task file and the `name:=value` overrides say, of the run and of its robots, by name. Raises SettingsError."""
-    values = config.load_task_file(task_file) if task_file else {}
-    values.update(config.parse_override(text) for text in overrides)
+    values = settings_yaml.load(task_file) if task_file else {}
+    values.update(settings_yaml.parse_override(text) for text in overrides)
     known = {**SETTINGS, **ROBOT_SETTINGS}
     for name in values:
         if name not in known:
