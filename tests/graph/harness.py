@@ -113,6 +113,17 @@ def finish(process: subprocess.Popen, timeout: float = TIMEOUT) -> tuple[int, st
     return process.returncode, output, errors
 
 
+def end(*processes: subprocess.Popen) -> list[tuple[str, str | None]]:
+    """Asks processes to end; what each said. None is left, also where one does not."""
+    for process in processes:
+        process.terminate()
+    try:
+        return [process.communicate(timeout=TIMEOUT) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+
+
 def oracle(folder: Path, values: dict) -> tuple[str, float]:
     """The same run in this process: SHA-256 of the final weights and mean return of the evaluation."""
     settings = config.from_flat(values)

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from harness import REPOSITORY, Listener
+from harness import REPOSITORY, Listener, end
 
 from dae_ros.ros import names, qos
 
@@ -41,8 +41,7 @@ def test_a_run_is_recorded_read_and_learnt_from_as_documented(domain, tmp_path):
             listener.spin_until(lambda: heard)
         finish(f'{train} {SHORTER}', tmp_path)
     finally:
-        recorder.terminate()
-        said = recorder.communicate(timeout=60)[0]
+        (said, _), = end(recorder)
     assert recorder.returncode == 0 and 'messages in bags/navigation' in said
 
     assert 'messages played' in finish(play, tmp_path)

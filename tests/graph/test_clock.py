@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import REPOSITORY, SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of, preloadable
+from harness import REPOSITORY, SMALL, Listener, bringup, end, finish, oracle, pid_of, preloadable
 from test_parameters import start
 
 from dae_ros import config
@@ -36,8 +36,7 @@ def test_a_node_whose_clock_stands_still_goes_on_giving_signs_of_life(domain, tm
             listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, heard.append, qos.EVENTS)
             listener.spin_until(lambda: len(heard) >= 3)
     finally:
-        process.terminate()
-        _, errors = process.communicate(timeout=TIMEOUT)
+        (_, errors), = end(process)
     assert all(report.header.stamp.sec == 0 for report in heard) and 'Traceback' not in errors
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of
+from harness import SMALL, Listener, bringup, end, finish, oracle, pid_of
 from std_msgs.msg import UInt32
 from test_parameters import start
 
@@ -95,8 +95,7 @@ def test_a_node_started_by_hand_shares_no_memory_unless_it_is_told_to(environmen
             listener.spin_until(lambda: bool(heard))
         assert ('/dev/shm/fastrtps' in Path(f'/proc/{process.pid}/maps').read_text()) == shares
     finally:
-        process.terminate()
-        process.communicate(timeout=TIMEOUT)
+        end(process)
 
 
 def test_whoever_sets_how_far_discovery_reaches_or_a_profile_is_obeyed(monkeypatch):

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from harness import TIMEOUT, Listener
+from harness import TIMEOUT, Listener, end
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 
@@ -77,8 +77,7 @@ def test_the_agents_of_one_process_are_nodes_with_parameters_of_their_own(domain
                 value, = listener.call(GetParameters, f'agent_1_{robot}/get_parameters', request).values
                 assert value.integer_value == robot
     finally:
-        process.terminate()
-        _, errors = process.communicate(timeout=TIMEOUT)
+        (_, errors), = end(process)
     assert process.returncode == 0 and 'Traceback' not in errors, errors
 
 
@@ -96,8 +95,7 @@ def test_parameters_are_described_ranged_and_read_only_and_an_integer_beta_is_fi
             result, = listener.call(SetParameters, 'trainer/set_parameters', SetParameters.Request(parameters=[change])).results
             assert not result.successful
     finally:
-        process.terminate()
-        _, errors = process.communicate(timeout=TIMEOUT)
+        (_, errors), = end(process)
     assert process.returncode == 0 and 'Traceback' not in errors, errors
 
 
@@ -111,8 +109,7 @@ def test_every_node_starts_alone_with_its_defaults_in_any_namespace_and_ends_on_
                                      GetParameters.Request(names=[parameter]))
             assert response.values[0].type == 2
     finally:
-        process.terminate()
-        _, errors = process.communicate(timeout=TIMEOUT)
+        (_, errors), = end(process)
     assert process.returncode == 0 and 'Traceback' not in errors, errors
 
 

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 
 import pytest
-from harness import REPOSITORY, TIMEOUT
+from harness import REPOSITORY, TIMEOUT, end
 
 README = (REPOSITORY / 'README.md').read_text()
 SHORTER = '-p num_worlds:=8 -p total_steps:=400 -p evaluation_episodes:=8 -p epochs:=1 -p reward_network.epochs:=1'
@@ -69,10 +69,8 @@ def test_the_nodes_start_one_by_one_as_the_readme_says(nodes, folder):
         run(trainer, folder)
         assert list(folder.glob('runs/*/summary.json'))
     finally:
-        for process in processes:
-            process.terminate()
-        outputs = [process.communicate(timeout=TIMEOUT)[0] for process in processes]
-    assert [process.returncode for process in processes] == [0] * len(processes), outputs
+        said = end(*processes)
+    assert [process.returncode for process in processes] == [0] * len(processes), said
 
 
 @pytest.mark.parametrize('command', [line for line in COMMANDS if line.startswith('ros2 ')])
