@@ -1,4 +1,4 @@
-"""Draws a figure: every curve's mean over the seeds with its 95 % interval, a panel for each team or each task."""
+"""Draws a figure: every curve's mean over the seeds with its 95 % interval, or both seeds, a panel for each team or each task."""
 
 from __future__ import annotations
 
@@ -22,12 +22,18 @@ from reproduce.statistics import last
 
 YARDSTICKS = ('random', 'greedy', 'best')
 YARDSTICK_EPISODES = 1000
+FEW = 2  # seeds, of whose interval, a dozen of their distances wide, nothing could be seen
 POSSIBLE = {'win_rate': (0.0, 1.0), 'advantage/deviation': (0.0, np.inf)}
 """Least and largest value; Student's t knows of none."""
 
 
 def draw(curves: Curves, path: Path) -> None:
-    """Writes the figure as a PNG, as far as its runs are finished; a task that none of them is of has no panels."""
+    """Writes the figure as a PNG."""
+    composed(curves).savefig(path, dpi=150, format='png')
+
+
+def composed(curves: Curves) -> Canvas:
+    """The figure, as far as its runs are finished; a task that none of them is of has no panels."""
     figure = curves.figure
     rows = {task: [curves.averaged(task)] if figure.average else [[team] for team in figure.sizes(task)] for task in figure.tasks}
     rows = {task: row for task, row in rows.items() if any(_counts(curves, teams) for teams in row)} or rows
@@ -48,7 +54,7 @@ def draw(curves: Curves, path: Path) -> None:
         order = [curve for curve in figure.curves if curve in handles]
         canvas.legend([handles[curve] for curve in order], order, ncols=len(order) if len(order) < 5 else 3,
                       loc='outside upper center', fontsize=9, frameon=False)
-    canvas.savefig(path, dpi=150, format='png')
+    return canvas
 
 
 def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None:
@@ -81,9 +87,14 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     axes.margins(y=0.1)
     limits = axes.get_ylim()
     for curve, band in bands.items():
+        if [FEW] == curves.counts(teams, curve):
+            for seed in curves.seeds[teams[0], curve]:
+                values = seed.metrics[figure.shows][:len(band.steps)]
+                axes.plot(band.steps, values, color=_colour(curves, curve), linewidth=0.6, alpha=0.6)
+            continue
         low, high = np.clip([band.mean - band.half, band.mean + band.half], *POSSIBLE.get(figure.shows, (-np.inf, np.inf)))
         axes.fill_between(band.steps, low, high, color=_colour(curves, curve), alpha=0.2, linewidth=0)
-    axes.set_ylim(limits)  # of two seeds the interval can be wider than everything else there is to see
+    axes.set_ylim(limits)  # an interval can be wider than everything else there is to see
 
 
 def _points(axes: Axes, curves: Curves, teams: Sequence[Team]) -> None:

@@ -20,7 +20,7 @@ from reproduce.statistics import last, mean_and_interval, steps_to_reach
 HEADER = '''# Results
 
 The paper's figures, trained and drawn again by `make reproduce`. Lines and numbers are means over seeds, bands and ± their
-95 % intervals (Student's t).
+95 % intervals (Student's t); of two seeds each is a thin line.
 '''
 
 

@@ -25,6 +25,7 @@ from dae_ros.run_folder import RunFolder
 from dae_ros.weights.codec import decode_reward_network
 from reproduce import figures, run, schedule
 from reproduce.curves import COLUMNS, POINTS, Curves
+from reproduce.draw import composed
 from reproduce.figures import Run
 from reproduce.progress import Progress
 from reproduce.records import Records, finished_file
@@ -352,6 +353,17 @@ def test_a_figure_over_seconds_takes_the_time_of_the_updates(made_up):
     figure, records = made_up
     band = Curves(replace(figure, against='seconds'), records).band([figure.teams[0]], 'low', 'mean_return')
     np.testing.assert_allclose(band.steps, 2.0 * np.arange(1, 1 + len(band.steps)))
+
+
+def test_of_two_seeds_each_is_drawn_and_of_three_their_interval(made_up):
+    figure, records = made_up
+    third = figure.run(figure.teams[2], 'low', 3)
+    pretend_run(third, records, 7.0)
+    curves = Curves(replace(figure, shows='advantage/deviation', average=False), records)
+    line, = (axes for axes in composed(curves).axes if axes.get_title('left').startswith('line'))
+    low, high = curves.seeds[figure.teams[2], 'low'], curves.seeds[figure.teams[2], 'high']
+    assert (len(low), len(high)) == (3, 2)
+    assert len(line.collections) == 1 and len(line.lines) == 2 + len(high)
 
 
 def test_a_scattered_figure_shows_where_every_seed_ended(made_up, tmp_path):
