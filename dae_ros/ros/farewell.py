@@ -40,4 +40,6 @@ def _stop_listening(node: Node) -> None:
         find.argtypes, find.restype = [ctypes.c_void_p], ctypes.c_void_p
     set_listener.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64]
     with node.handle:
-        set_listener(participant_of(rmw_node_of(node.handle.pointer)), None, PATIENCE)
+        participant = participant_of(rmw_node_of(node.handle.pointer))
+        if participant is not None:
+            set_listener(participant, None, PATIENCE)
