@@ -87,13 +87,13 @@ def _panel(axes: Axes, curves: Curves, task: str, teams: Sequence[Team]) -> None
     axes.margins(y=0.1)
     limits = axes.get_ylim()
     for curve, band in bands.items():
-        if [FEW] == curves.counts(teams, curve):
+        colour = _colour(curves, curve)
+        if curves.counts(teams, curve) == [FEW]:
             for seed in curves.seeds[teams[0], curve]:
-                values = seed.metrics[figure.shows][:len(band.steps)]
-                axes.plot(band.steps, values, color=_colour(curves, curve), linewidth=0.6, alpha=0.6)
-            continue
-        low, high = np.clip([band.mean - band.half, band.mean + band.half], *POSSIBLE.get(figure.shows, (-np.inf, np.inf)))
-        axes.fill_between(band.steps, low, high, color=_colour(curves, curve), alpha=0.2, linewidth=0)
+                axes.plot(band.steps, seed.metrics[figure.shows][:len(band.steps)], color=colour, linewidth=0.6, alpha=0.6)
+        else:
+            low, high = np.clip([band.mean - band.half, band.mean + band.half], *POSSIBLE.get(figure.shows, (-np.inf, np.inf)))
+            axes.fill_between(band.steps, low, high, color=colour, alpha=0.2, linewidth=0)
     axes.set_ylim(limits)  # an interval can be wider than everything else there is to see
 
 

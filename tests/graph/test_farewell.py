@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import TIMEOUT, Listener, preloadable
+from harness import Listener, end, preloadable
 from std_msgs.msg import UInt32
 from test_parameters import start
 
@@ -18,16 +18,14 @@ def test_a_node_ends_while_it_is_told_that_another_has_left(domain, tmp_path, mo
     monkeypatch.setenv('LD_PRELOAD', str(preloadable('slow_farewell.c', tmp_path)))
     process, heard = start('parameter_server', cwd=tmp_path), []
     monkeypatch.delenv('LD_PRELOAD')
-    try:
-        with Listener() as listener:
+    with Listener() as listener:
+        try:
             publishers = [listener.node.create_publisher(UInt32, f'number_{number}', 1) for number in range(MANY)]
             listener.node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, heard.append, qos.EVENTS)
             listener.spin_until(lambda: bool(heard))
             for publisher in publishers:
                 listener.node.destroy_publisher(publisher)
             listener.spin_until(told.exists)
-            process.terminate()
-            _, errors = process.communicate(timeout=TIMEOUT)
-    finally:
-        process.kill()
+        finally:
+            (_, errors), = end(process)
     assert process.returncode == 0, errors
