@@ -142,13 +142,14 @@ class Stage(Listener):
 
     def tick_until(self, condition: Callable[[], bool], *shown: int) -> None:
         """Lets the clock go on, ten times as fast as at most, until `condition` holds; AssertionError if it never does."""
-        self._repeat_until(condition, lambda: self.tick(*shown))
+        self.repeat_until(condition, lambda: self.tick(*shown))
 
     def show_until(self, condition: Callable[[], bool], robot: int, **changes) -> None:
         """Shows the same odometry, of which some may get lost, until `condition` holds; AssertionError if it never does."""
-        self._repeat_until(condition, lambda: self.show(robot, **changes))
+        self.repeat_until(condition, lambda: self.show(robot, **changes))
 
-    def _repeat_until(self, condition: Callable[[], bool], act: Callable[[], None]) -> None:
+    def repeat_until(self, condition: Callable[[], bool], act: Callable[[], None]) -> None:
+        """Acts, a hundred times a second at most, until `condition` holds; AssertionError if it never does."""
         deadline = time.monotonic() + TIMEOUT
         while not condition():
             assert time.monotonic() < deadline, dict(self.diagnostics)
