@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from dae_ros_msgs import msg
 from geometry_msgs.msg import Vector3Stamped
-from harness import REPOSITORY, SMALL, Listener, bringup, finish, network_file, oracle
+from harness import REPOSITORY, SMALL, Listener, bringup, finish, network_file
 from numpy.lib.stride_tricks import sliding_window_view
 from robots import FRAME, PERIOD, PLACES, Processes, Stage
 from visualization_msgs.msg import MarkerArray
 
-from dae_ros.learning.credit import CreditMeter
+from dae_ros import config
+from dae_ros.learning.credit import Credit, CreditMeter
 from dae_ros.learning.reward_files import load
 from dae_ros.robots import standard_messages
 from dae_ros.robots.pilot import stamp_at
 from dae_ros.robots.setup import RUN
+from dae_ros.rollout.in_process import train
 from dae_ros.ros import convert, convert_robots, names, qos
 from dae_ros.ros.graph import watching
+from dae_ros.run_folder import RunFolder
+from dae_ros.training import Training
 from dae_ros.types import Action
+from dae_ros.worlds import make_worlds
 
-WORLD, STEPS, UPDATES, ROLLOUTS = 3, 25, 5, 6  # the last rollout is the evaluation's
+WORLD, STEPS, UPDATES = 3, 25, 5
 
 
 def documented(executable, file=''):
@@ -32,36 +38,60 @@ def documented(executable, file=''):
     return f'dae_ros_nodes.{Path(path).name}', *(word.replace('runs/reward_network.safetensors', str(file)) for word in arguments)
 
 
+def watched_alone(folder, values):
+    """What the same run in this process ends with, and the credit of all its steps."""
+    settings = config.from_flat(values)
+    worlds = make_worlds(settings.task)
+    training = Training(settings, worlds.spec, RunFolder(folder, settings))
+    training.watch(WORLD)
+    credits = []
+    train(training, worlds, lambda: credits.append(training.credit))
+    training.close()
+    of_all = Credit(*map(np.concatenate, zip(*credits[:UPDATES])))  # and of the last update once more, after the evaluation
+    return (training.weights_sha256(), float(training.evaluation.mean())), of_all
+
+
 def test_the_trainer_and_a_node_with_its_reward_networks_tell_the_same_difference_rewards(make_graph, tmp_path):
-    """What is told of who earns what changes no weight."""
+    """What is told of who earns what changes no weight. Who finds the others late misses the first steps."""
     file = network_file(tmp_path / 'networks.safetensors')
     values = {**SMALL, 'reward_network.path': str(file), 'reward_network.freeze': True}
+    result, credit = watched_alone(tmp_path / 'alone', values)
+    steps = {reward: step for step, reward in enumerate(credit.rewards.tolist())}
+    assert len(steps) == STEPS * UPDATES and np.ptp(credit.differences) > 0.1
+    by_trainer, by_node = ([[] for _ in range(3)] for _ in range(2))
+
+    def hear(robot: int, message: Vector3Stamped) -> None:
+        told, step = message.vector, steps.get(message.vector.x)
+        if step is not None:  # the node tells the evaluation as well
+            by = by_node if np.isnan(told.z) else by_trainer
+            by[robot].append((step, told.y, told.z, standard_messages.seconds(message.header.stamp)))
+
     graph, processes = make_graph(tmp_path / 'graph', values), Processes(tmp_path)
     graph.processes = {process.name: process for process in watching(list(graph.processes.values()), WORLD)}
-    heard = [[] for _ in range(3)]
     try:
         with Listener() as listener:
-            for robot, said in enumerate(heard):
-                listener.node.create_subscription(Vector3Stamped, names.CREDIT.format(robot), said.append, qos.ROLLOUT)
+            for robot in range(3):
+                listener.node.create_subscription(Vector3Stamped, names.CREDIT.format(robot), partial(hear, robot), qos.ROLLOUT)
             processes.python('credit', *documented('credit', file), '-p', f'world:={WORLD}')
             graph.start(*(name for name in graph.names if name != 'parameter_server'))  # for which all wait
             listener.spin_until(lambda: listener.node.count_subscribers(names.JOINT_STATE) == 2)
             listener.wait_for_status(lambda status: status.detail == 'waiting for parameter server')
             graph.start('parameter_server')
-            listener.spin_until(lambda: all(len(said) == STEPS * (UPDATES + ROLLOUTS) for said in heard),
-                                lambda: f'{[len(said) for said in heard]} {processes.log("credit")}')
+            listener.spin_until(lambda: all(len(said) >= STEPS for said in by_trainer + by_node),
+                                lambda: f'{[len(said) for said in by_trainer + by_node]} {processes.log("credit")}')
         assert graph.wait() == 0, graph.log('trainer')
         assert processes.end('credit') == 0, processes.log('credit')
     finally:
         processes.stop()
-    assert graph.result() == oracle(tmp_path / 'alone', values)
-    for said in heard:
-        numbers = np.array([(message.vector.x, message.vector.y, message.vector.z) for message in said])
-        by_trainer, by_node = (numbers[which] for which in (~np.isnan(numbers[:, 2]), np.isnan(numbers[:, 2])))
-        np.testing.assert_allclose(by_node[:len(by_trainer), :2], by_trainer[:, :2], rtol=1e-5, atol=1e-5)
-        assert len(by_trainer) == STEPS * UPDATES and np.ptp(by_trainer[:, 1]) > 0.1 and np.ptp(by_trainer[:, 2]) > 0.1
-        times = [standard_messages.seconds(message.header.stamp) for message in said if not np.isnan(message.vector.z)]
-        np.testing.assert_allclose(times, 0.1 * np.arange(STEPS * UPDATES))
+    assert graph.result() == result
+    for robot in range(3):
+        for told in by_trainer[robot], by_node[robot]:
+            at, own, advantages, times = np.array(told).T
+            at = at.astype(int)
+            np.testing.assert_allclose(own, credit.differences[at, robot], rtol=1e-5, atol=1e-5)
+            if told is by_trainer[robot]:
+                np.testing.assert_allclose(advantages, credit.advantages[at, robot], rtol=1e-5, atol=1e-5)
+                np.testing.assert_allclose(times, 0.1 * at)
 
 
 def test_bringup_has_the_trainer_tell_the_credit_of_the_world_it_is_asked_to_watch(domain, tmp_path):
