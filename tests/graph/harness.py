@@ -17,6 +17,7 @@ import pytest
 import rclpy
 from dae_ros_msgs.msg import TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.client import Client
 from std_srvs.srv import Trigger
 
 from dae_ros import config
@@ -68,6 +69,14 @@ class Graph:
             command = [*self.prefixes.get(name, ()), sys.executable, '-m', f'dae_ros_nodes.{process.executable}',
                        *process.arguments(self.folder.settings_file, self._namespace)]
             self.pids[name] = self._supervisor.start(name, command, os.environ)
+
+    def start_paused(self, listener: Listener) -> None:
+        """Starts all nodes; the trainer waits for `names.RESUME` before the first rollout."""
+        listener.client(Trigger, names.RESUME)
+        self.start('trainer')
+        assert listener.call(Trigger, names.PAUSE, Trigger.Request()).success
+        self.start(*(name for name in self.names if name != 'trainer'))
+        listener.wait_for_status(lambda status: status.state == TrainingStatus.PAUSED)
 
     def kill(self, *names: str) -> None:
         """Kills nodes that were started; they are gone when this returns."""
@@ -179,6 +188,7 @@ class Listener:
         look_for_overlooked(self.node)
         self.executor = Executor(context=self.context)
         self.executor.add_node(self.node)
+        self._clients: dict[str, Client] = {}
 
     def __enter__(self) -> Listener:
         return self
@@ -210,19 +220,22 @@ class Listener:
         self.node.destroy_subscription(subscription)
         return next(status for status in heard if condition(status))
 
-    def call(self, kind: type, name: str, request):
-        """The response of a service, which must bear being asked twice.
+    def client(self, kind: type, name: str) -> Client:
+        """The client of a service that `call` uses. A server may drop the answer to one it got to know within the last 100 ms:
+        what bears no second asking, or cannot wait for it, has its client made long before."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        return self._clients[name]
 
-        A server that knows its client for less than 100 ms may answer before it can reach it; rmw then drops the answer.
-        """
-        client = self.node.create_client(kind, name)
+    def call(self, kind: type, name: str, request):
+        """The response of a service, which is asked again if none comes."""
+        client = self.client(kind, name)
         assert client.wait_for_service(TIMEOUT), f'no service {name}'
         futures = []
         while not any(future.done() for future in futures):
             assert len(futures) < TIMEOUT / ANSWER_TIMEOUT, f'{name} does not answer'
             futures.append(client.call_async(request))
             self._holds_within(ANSWER_TIMEOUT, lambda: any(future.done() for future in futures))
-        self.node.destroy_client(client)
         return next(future.result() for future in futures if future.done())
 
 
@@ -267,10 +280,7 @@ class Recorder:
     def record_run(self) -> None:
         """Takes the graph through its whole run, of which the recorder hears everything."""
         graph, listener = self._graph, self._listener
-        graph.start('trainer')
-        assert listener.call(Trigger, names.PAUSE, Trigger.Request()).success
-        graph.start(*(name for name in graph.names if name != 'trainer'))
-        listener.wait_for_status(lambda status: status.state == TrainingStatus.PAUSED)
+        graph.start_paused(listener)
         listener.spin_until(lambda: self.sentence == 'recording', lambda: graph.log(self._name))
         assert listener.call(Trigger, names.RESUME, Trigger.Request()).success
         assert graph.wait() == 0, graph.log('trainer')

@@ -132,6 +132,8 @@ def test_a_team_among_hostile_messages_counts_and_survives_them_all_and_ends_wit
         refusals, fuzzer = Refusals(listener), Fuzzer(listener, run, N, SEED, HOSTILE)
         messages = bad_messages(run)
         publishers = {topic: listener.node.create_publisher(kind, topic, qos.LATCHED_INPUT) for kind, topic, _, _ in messages}
+        for service in names.PAUSE, names.RESUME:
+            listener.client(Trigger, service)
         process = bringup(tmp_path / 'run', values, '--key-file', str(key_file))
         try:
             listener.wait_for_status(lambda status: learnt(status) >= UPDATES // 2)

@@ -85,7 +85,7 @@ def test_messages_come_in_order_at_a_rate_from_an_offset_into_another_namespace(
 def test_a_paused_player_goes_step_by_step_and_then_on_and_around(play, tmp_path):
     bag = counted(tmp_path / 'bag', range(5))
     with Counter() as listener:
-        step = listener.node.create_client(Trigger, '/player/play_next')
+        step = listener.client(Trigger, '/player/play_next')
         player = play(bag, '--start-paused', '--loop', '--wait-for-subscribers')
 
         def call(name):

@@ -64,6 +64,8 @@ def test_a_recorder_killed_and_started_again_disturbs_nothing_and_both_bags_are_
     graph = make_graph(tmp_path / 'graph', values)
     with Listener() as listener:
         first, second = (Recorder(graph, listener, tmp_path / 'bags' / name, name) for name in ('first', 'second'))
+        for service in names.PAUSE, names.RESUME:
+            listener.client(Trigger, service)
         graph.start(*(name for name in graph.names if name != 'second'))
         listener.spin_until(lambda: int(first.values.get('messages', 0)) > 3 * 150, lambda: graph.log('first'))
         graph.kill('first')

@@ -8,7 +8,6 @@ import signal
 from pathlib import Path
 
 import pytest
-from dae_ros_msgs.msg import TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from harness import SMALL, Graph, Listener, bringup, finish, oracle, processes_naming
 from std_srvs.srv import Trigger
@@ -20,11 +19,8 @@ def test_a_second_trainer_or_server_says_whose_the_team_is_and_ends_and_the_firs
         make_graph, tmp_path):
     first = make_graph(tmp_path / 'first', SMALL)
     second = make_graph(tmp_path / 'second', {**SMALL, 'seed': 2})
-    first.start(*first.names)
     with Listener() as listener:
-        listener.wait_for_status(lambda status: status.policy_version >= 1)
-        listener.call(Trigger, names.PAUSE, Trigger.Request())
-        listener.wait_for_status(lambda status: status.state == TrainingStatus.PAUSED)
+        first.start_paused(listener)
         second.start('trainer')
         assert second.wait() == 2
         second.processes['parameter_server'] = first.processes['parameter_server']
@@ -40,10 +36,8 @@ def test_a_second_trainer_or_server_says_whose_the_team_is_and_ends_and_the_firs
 
 def test_a_second_run_in_the_same_folder_says_so_and_ends_and_the_first_has_its_weights(make_graph, tmp_path):
     graph = make_graph(tmp_path / 'run', SMALL)
-    graph.start(*graph.names)
     with Listener() as listener:
-        listener.wait_for_status(lambda status: status.policy_version >= 1)
-        listener.call(Trigger, names.PAUSE, Trigger.Request())
+        graph.start_paused(listener)
         code, output, errors = finish(bringup(tmp_path / 'run', SMALL, '--namespace', 'other'))
         assert code == 2 and re.search(rf'error: another (trainer|parameter server) is at work in {tmp_path}/run', errors), errors
         assert 'Traceback' not in output + errors

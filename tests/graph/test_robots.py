@@ -200,6 +200,7 @@ def test_the_navigation_team_covers_the_landmarks_with_foreign_differential_robo
     for robot in range(3):
         # A loaded machine's hiccups last SPEEDUP times as long on the robots' clock.
         start_robot(processes, robot, odometry_timeout=0.15 * SPEEDUP, action_timeout=0.25 * SPEEDUP)
+    stage.client(Trigger, 'next_layout')
     landmarks, truth = [], []
     for topic, heard, profile in ((names.LANDMARKS, landmarks, qos.LATCHED_INPUT), ('ground_truth', truth, 10)):
         stage.node.create_subscription(PoseArray, topic, heard.append, profile)
@@ -223,6 +224,7 @@ def test_our_simulator_plays_robots_that_the_same_bridges_drive(domain, stage, p
     processes.node('world', 'robots', real_time_factor=4.0, **body)
     for robot in range(3):
         start_robot(processes, robot, **body, odometry_timeout=0.6, action_timeout=1.0)
+    stage.client(Trigger, 'robots/next_episode')
     shown, odometry, landmarks = [], {}, []
     stage.node.create_subscription(MarkerArray, names.MARKERS, shown.append, qos.SENSOR)
     stage.node.create_subscription(PoseArray, names.LANDMARKS, landmarks.append, qos.LATCHED_INPUT)

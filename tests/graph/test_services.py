@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from dae_ros_msgs.msg import TrainingStatus
 from dae_ros_msgs.srv import GetPolicy
 from harness import SMALL, Listener, oracle
 from std_srvs.srv import Trigger
@@ -21,10 +20,7 @@ def listener(domain):
 
 def test_a_paused_training_waits_saves_and_goes_on_to_the_same_weights(make_graph, listener, tmp_path):
     graph = make_graph(tmp_path / 'graph', SMALL)
-    graph.start('trainer')
-    assert listener.call(Trigger, 'trainer/pause', Trigger.Request()).success
-    graph.start(*(name for name in graph.names if name != 'trainer'))
-    listener.wait_for_status(lambda status: status.state == TrainingStatus.PAUSED)
+    graph.start_paused(listener)
     saved = listener.call(Trigger, 'trainer/save', Trigger.Request())
     assert saved.success and list(graph.folder.checkpoints.iterdir())
     assert listener.call(Trigger, 'trainer/resume', Trigger.Request()).success
