@@ -7,6 +7,7 @@ import signal
 from collections import Counter
 from contextlib import contextmanager
 from typing import Any, Callable, Iterable, Iterator
+from weakref import WeakSet
 
 import rclpy
 from dae_ros_msgs.msg import TrainingStatus
@@ -61,6 +62,8 @@ def _set_none_of_all(_: SetParametersAtomically.Request,
     return response
 
 
+_nodes_of_process: WeakSet[TeamNode] = WeakSet()  # also those refused while they were being made
+
 _REFUSALS = {SetParameters: _set_none, SetParametersAtomically: _set_none_of_all}
 
 
@@ -78,6 +81,7 @@ class TeamNode(Node):
         self._clock_hearers: list[Callable[[ClockMessage], None]] = []
         super().__init__(name, automatically_declare_parameters_from_overrides=True,
                          parameter_overrides=[Parameter(key, value=value) for key, value in given.items()])
+        _nodes_of_process.add(self)
         self.settings: dict[str, Any] = params.declare(self, declared)
         self.done = False
         self.busy = False  # whether a callback is at work
@@ -322,7 +326,7 @@ def run_together(make_nodes: Callable[[], list[TeamNode]], args: list[str] | Non
                 for node in nodes:
                     node.close()
             finally:
-                leave(nodes)
+                leave(list(_nodes_of_process))
                 rclpy.try_shutdown()
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
