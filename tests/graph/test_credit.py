@@ -134,10 +134,12 @@ def test_beside_robots_a_task_monitor_and_the_node_tell_and_show_who_earns_what(
                                                 (MarkerArray, names.MARKERS, shown, qos.EVENTS)):
                 stage.node.create_subscription(kind, topic, heard.append, profile)
             act = [stage.node.create_publisher(msg.Action, names.ACTION.format(robot), qos.ROLLOUT) for robot in range(3)]
-            processes.python('task_monitor', *documented('task_monitor'), '-p', 'use_sim_time:=true')
             processes.python('credit', *documented('credit', file), '-p', 'use_sim_time:=true')
+            stage.spin_until(lambda: 'waiting for joint_state, shared_reward' in stage.diagnostics['credit'])
+            processes.python('task_monitor', *documented('task_monitor'), '-p', 'use_sim_time:=true')
             stage.landmarks.publish(convert_robots.landmarks_message(PLACES[::-1], stage.now, FRAME))
             stage.tick_until(lambda: bool(states), 0, 1, 2)
+            stage.spin_until(lambda: 'waiting for a whole step' in stage.diagnostics['credit'], lambda: str(stage.diagnostics))
 
             def step() -> None:
                 stage.places += draw.normal(scale=0.03, size=(3, 2))
