@@ -161,4 +161,4 @@ def test_beside_robots_a_task_monitor_and_the_node_tell_and_show_who_earns_what(
     assert np.ptp(differences) > 0.01 and all(np.isnan(message.vector.z) for message in told)
     assert np.isclose(sliding_window_view(expected, len(told)), differences, rtol=1e-5, atol=1e-5).all(axis=1).any()
     texts = {float(marker.text) for array in shown for marker in array.markers if (marker.ns, marker.id) == ('credit', 1)}
-    assert texts <= {round(difference, 3) for difference in differences}
+    assert texts <= {round(difference, 3) for difference in expected}
