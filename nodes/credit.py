@@ -13,7 +13,6 @@ from typing import Any, Callable
 import torch
 from dae_ros_msgs import msg
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.subscription import Subscription
 
 from dae_ros.config import CreditSettings, declarations
 from dae_ros.errors import SettingsError
@@ -34,14 +33,13 @@ class CreditNode(TeamNode):
         self._meter = meter = CreditMeter(networks, self.settings['world'])
         robots = range(networks.spec.num_agents)
         self._credit = [self.publisher(Vector3Stamped, names.CREDIT.format(robot), qos.ROLLOUT) for robot in robots]
-        self._heard: dict[str, Subscription] = {}
         self._join(msg.JointState, names.JOINT_STATE, convert.joint_state, meter.on_joint_state)
         self._join(msg.SharedReward, names.SHARED_REWARD, convert.shared_reward, meter.on_reward)
         for robot in robots:
             self._join(msg.Action, names.ACTION.format(robot), convert.action, meter.on_action)
 
     def _join(self, kind: type, topic: str, read: Callable[[Any], Any], take: Callable[[Any], Credit | None]) -> None:
-        self._heard[topic] = self.listen(kind, topic, qos.ROLLOUT, partial(self._tell, read, take))
+        self.listen(kind, topic, qos.ROLLOUT, partial(self._tell, read, take))
 
     def _tell(self, read: Callable[[Any], Any], take: Callable[[Any], Credit | None], message: Any) -> None:
         credit = take(read(message))
@@ -53,8 +51,7 @@ class CreditNode(TeamNode):
 
     def diagnose(self):
         meter = self._meter
-        silent = ', '.join(topic for topic, subscription in self._heard.items() if not subscription.get_publisher_count())
-        sentence = 'telling' if meter.steps else f'waiting for {silent or "a whole step"}'
+        sentence = 'telling' if meter.steps else f'waiting for {self.silent_topics() or "a whole step"}'
         return sentence, {'steps': meter.steps, 'steps after a hole': meter.holes}
 
 

@@ -37,9 +37,8 @@ class RecorderNode(TeamNode):
         self._recording = Recording(path, [as_written(*topic) for topic in zip(topics, full_names)], settings['storage'],
                                     settings['compression'], settings['split_megabytes'] * 10**6,
                                     settings['split_seconds'] * 10**9)
-        self._subscriptions_by_name = {
-            topic.name: self.listen(topic.kind, topic.name, topic.profile, partial(self._record, topic, full_name), raw=True)
-            for topic, full_name in zip(topics, full_names)}
+        for topic, full_name in zip(topics, full_names):
+            self.listen(topic.kind, topic.name, topic.profile, partial(self._record, topic, full_name), raw=True)
         self.every(FLUSH_PERIOD / 1e9, lambda: self._recording.flush_if_due(self._now()))
         self.get_logger().info(f'recording {len(topics)} topics in {self._recording.path}')
 
@@ -56,8 +55,8 @@ class RecorderNode(TeamNode):
         return self._epoch + time.monotonic_ns()
 
     def diagnose(self):
-        silent = [name for name, subscription in self._subscriptions_by_name.items() if not subscription.get_publisher_count()]
-        sentence = f'waiting for {", ".join(silent)}' if silent else 'recording'
+        silent = self.silent_topics()
+        sentence = f'waiting for {silent}' if silent else 'recording'
         return sentence, {'bag': str(self._recording.path), 'messages': self._recording.messages.total(),
                           **{f'missed {topic}': count for topic, count in sorted(self._missed.items())}}
 

@@ -89,6 +89,7 @@ class TeamNode(Node):
         self.failure: BaseException | None = None  # what a callback raised; ends the node
         self._moment: float | None = None  # of simulated time, where each counts
         self._refusals: Counter[tuple[str, str]] = Counter()
+        self._subscriptions_by_topic: dict[str, Subscription] = {}
         self._diagnostics = self.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.EVENTS)
         self.every(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
         look_for_overlooked(self)
@@ -111,7 +112,14 @@ class TeamNode(Node):
             self.on_matched()
 
         callbacks = SubscriptionEventCallbacks(matched=self._guarded(match))
-        return self.create_subscription(kind, topic, self._guarded(receive), profile, event_callbacks=callbacks, raw=raw)
+        subscription = self.create_subscription(kind, topic, self._guarded(receive), profile, event_callbacks=callbacks, raw=raw)
+        self._subscriptions_by_topic[topic] = subscription
+        return subscription
+
+    def silent_topics(self) -> str:
+        """The topics listened to that nobody publishes, for people to read; empty where there are none."""
+        return ', '.join(topic for topic, subscription in self._subscriptions_by_topic.items()
+                         if not subscription.get_publisher_count())
 
     def every(self, period: float, act: Callable[[], None]) -> Timer:
         """A timer that calls `act` each `period` seconds, whatever becomes of the host's clock or of simulated time."""
