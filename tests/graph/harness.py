@@ -34,7 +34,7 @@ from dae_ros.ros.node import Executor, look_for_overlooked
 from dae_ros.ros.supervisor import Supervisor
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
-from dae_ros.worlds import make_worlds, world_spec
+from dae_ros.worlds import Worlds, make_worlds, world_spec
 
 TIMEOUT = 120  # s for anything a test waits for; a run takes a tenth of it
 ANSWER_TIMEOUT = 10  # s before a service is asked again
@@ -133,12 +133,22 @@ def end(*processes: subprocess.Popen) -> list[tuple[str, str | None]]:
             process.kill()
 
 
-def oracle(folder: Path, values: dict) -> tuple[str, float]:
-    """The same run in this process: SHA-256 of the final weights and mean return of the evaluation."""
+def begin_alone(folder: Path, values: dict) -> tuple[Training, Worlds]:
+    """The same run in this process, about to begin."""
     settings = config.from_flat(values)
     worlds = make_worlds(settings.task)
-    training = Training(settings, worlds.spec, RunFolder(folder, settings))
+    return Training(settings, worlds.spec, RunFolder(folder, settings)), worlds
+
+
+def oracle(folder: Path, values: dict) -> tuple[str, float]:
+    """What the same run in this process ends with, as `Graph.result`."""
+    training, worlds = begin_alone(folder, values)
     train(training, worlds, lambda: None)
+    return result_of(training)
+
+
+def result_of(training: Training) -> tuple[str, float]:
+    """As `Graph.result`, of a training that is finished; closes it."""
     training.close()
     return training.weights_sha256(), float(training.evaluation.mean())
 

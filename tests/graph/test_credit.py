@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 from dae_ros_msgs import msg
 from geometry_msgs.msg import Vector3Stamped
-from harness import REPOSITORY, SMALL, Listener, bringup, finish, network_file
+from harness import REPOSITORY, SMALL, Listener, begin_alone, bringup, finish, network_file, result_of
 from numpy.lib.stride_tricks import sliding_window_view
 from robots import FRAME, PERIOD, PLACES, Processes, Stage
 from visualization_msgs.msg import MarkerArray
 
-from dae_ros import config
 from dae_ros.learning.credit import Credit, CreditMeter
 from dae_ros.learning.reward_files import load
 from dae_ros.robots import standard_messages
@@ -23,12 +22,9 @@ from dae_ros.robots.setup import RUN
 from dae_ros.rollout.in_process import train
 from dae_ros.ros import convert, convert_robots, names, qos
 from dae_ros.ros.graph import watching
-from dae_ros.run_folder import RunFolder
-from dae_ros.training import Training
 from dae_ros.types import Action
-from dae_ros.worlds import make_worlds
 
-WORLD, STEPS, UPDATES = 3, 25, 5
+WORLD, STEPS, UPDATES, EVALUATIONS = 3, 25, 5, 1
 
 
 def documented(executable, file=''):
@@ -40,15 +36,12 @@ def documented(executable, file=''):
 
 def watched_alone(folder, values):
     """What the same run in this process ends with, and the credit of all its steps."""
-    settings = config.from_flat(values)
-    worlds = make_worlds(settings.task)
-    training = Training(settings, worlds.spec, RunFolder(folder, settings))
+    training, worlds = begin_alone(folder, values)
     training.watch(WORLD)
     credits = []
     train(training, worlds, lambda: credits.append(training.credit))
-    training.close()
     of_all = Credit(*map(np.concatenate, zip(*credits[:UPDATES])))  # and of the last update once more, after the evaluation
-    return (training.weights_sha256(), float(training.evaluation.mean())), of_all
+    return result_of(training), of_all
 
 
 def test_the_trainer_and_a_node_with_its_reward_networks_tell_the_same_difference_rewards(make_graph, tmp_path):
@@ -57,14 +50,17 @@ def test_the_trainer_and_a_node_with_its_reward_networks_tell_the_same_differenc
     values = {**SMALL, 'reward_network.path': str(file), 'reward_network.freeze': True}
     result, credit = watched_alone(tmp_path / 'alone', values)
     steps = {reward: step for step, reward in enumerate(credit.rewards.tolist())}
-    assert len(steps) == STEPS * UPDATES and np.ptp(credit.differences) > 0.1
-    by_trainer, by_node = ([[] for _ in range(3)] for _ in range(2))
+    assert len(steps) == STEPS * UPDATES and np.ptp(credit.differences) > 0.1 and np.ptp(credit.advantages) > 0.1
+    by_trainer, by_node, of_evaluation = ([[] for _ in range(3)] for _ in range(3))
 
     def hear(robot: int, message: Vector3Stamped) -> None:
         told, step = message.vector, steps.get(message.vector.x)
-        if step is not None:  # the node tells the evaluation as well
-            by = by_node if np.isnan(told.z) else by_trainer
-            by[robot].append((step, told.y, told.z, standard_messages.seconds(message.header.stamp)))
+        by = of_evaluation if step is None else by_node if np.isnan(told.z) else by_trainer
+        by[robot].append((step, told.y, told.z, standard_messages.seconds(message.header.stamp)))
+
+    def is_all_told() -> bool:
+        return (all(said and said[-1][0] == STEPS * UPDATES - 1 for said in by_trainer + by_node)
+                and all(len(said) == STEPS * EVALUATIONS for said in of_evaluation))
 
     graph, processes = make_graph(tmp_path / 'graph', values), Processes(tmp_path)
     graph.processes = {process.name: process for process in watching(list(graph.processes.values()), WORLD)}
@@ -77,8 +73,8 @@ def test_the_trainer_and_a_node_with_its_reward_networks_tell_the_same_differenc
             listener.spin_until(lambda: listener.node.count_subscribers(names.JOINT_STATE) == 2)
             listener.wait_for_status(lambda status: status.detail == 'waiting for parameter server')
             graph.start('parameter_server')
-            listener.spin_until(lambda: all(len(said) >= STEPS for said in by_trainer + by_node),
-                                lambda: f'{[len(said) for said in by_trainer + by_node]} {processes.log("credit")}')
+            listener.spin_until(is_all_told, lambda: f'{[len(said) for said in by_trainer + by_node + of_evaluation]} '
+                                                     f'{processes.log("credit")}')
         assert graph.wait() == 0, graph.log('trainer')
         assert processes.end('credit') == 0, processes.log('credit')
     finally:
@@ -88,6 +84,7 @@ def test_the_trainer_and_a_node_with_its_reward_networks_tell_the_same_differenc
         for told in by_trainer[robot], by_node[robot]:
             at, own, advantages, times = np.array(told).T
             at = at.astype(int)
+            np.testing.assert_array_equal(at, np.arange(at[0], STEPS * UPDATES))
             np.testing.assert_allclose(own, credit.differences[at, robot], rtol=1e-5, atol=1e-5)
             if told is by_trainer[robot]:
                 np.testing.assert_allclose(advantages, credit.advantages[at, robot], rtol=1e-5, atol=1e-5)

@@ -10,26 +10,20 @@ import time
 import numpy as np
 import pytest
 import yaml
-from harness import REPOSITORY, SMALL, Listener, Recorder, oracle
+from harness import REPOSITORY, SMALL, Listener, Recorder, begin_alone, oracle
 from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
 
-from dae_ros import config
 from dae_ros.replay.dataset import Dataset
 from dae_ros.rollout.in_process import train
 from dae_ros.ros import names
 from dae_ros.ros.graph import NodeProcess
 from dae_ros.ros.recorded import team_topics
-from dae_ros.run_folder import RunFolder
-from dae_ros.training import Training
-from dae_ros.worlds import make_worlds
 
 
 def trajectories(folder, values):
     """Every rollout of the same run in this process, the evaluation's too."""
-    settings = config.from_flat(values)
-    worlds = make_worlds(settings.task)
-    training, seen = Training(settings, worlds.spec, RunFolder(folder, settings)), []
+    (training, worlds), seen = begin_alone(folder, values), []
     consume = training.consume
     training.consume = lambda trajectory: (seen.append(trajectory), consume(trajectory))
     train(training, worlds, lambda: None)
