@@ -13,6 +13,7 @@ from dae_ros.rollout.assembler import Assembler
 from dae_ros.rollout.in_process import InProcessCollector
 from dae_ros.rollout.lockstep import AgentEnd, WorldEnd
 from dae_ros.types import Action, JointState, Observation, SharedReward
+from tests.played import POLICY, REQUEST, RUN, VERSION, A, Drifting, N, W, assert_same, play, refused, stamped
 from tests.test_learner import (  # noqa: F401
     COMA,
     LEARNER,
@@ -25,7 +26,6 @@ from tests.test_learner import (  # noqa: F401
     random_trajectory,
     state_of,
 )
-from tests.test_lockstep import POLICY, REQUEST, RUN, VERSION, A, Drifting, N, W, assert_same, play, refused, stamped
 
 LONG = REQUEST._replace(num_steps=24)
 
