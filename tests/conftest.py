@@ -5,7 +5,9 @@ import functools
 import dae_ros_nodes  # noqa: F401  sets the variables; before numpy and torch are imported
 import pytest
 
+from dae_ros.learning.learner import Learner
 from dae_ros.learning.native import build
+from tests.learners import LEARNER, REWARD, SPEC
 
 
 @pytest.fixture(scope='session')
@@ -18,3 +20,17 @@ def compiled(tmp_path_factory):
         return path
 
     return compiled_with
+
+
+@pytest.fixture
+def make_learner():
+    """Makes learners and ends their threads."""
+    made = []
+
+    def make(settings=LEARNER, reward_settings=REWARD, spec=SPEC, seed=1):
+        made.append(Learner(spec, settings, reward_settings, seed))
+        return made[-1]
+
+    yield make
+    for learner in made:
+        learner.close()

@@ -66,6 +66,13 @@ def q_values(game, policies, rewards):
     return solved.reshape(game.rewards.shape)
 
 
+def beta_q(game, policies, beta, agent):
+    """The Q-function of eq. (16)'s rewards, by solving their chain; the series in gamma beta is a chain of its own."""
+    expected = expected_over_own(game, policies, agent, game.rewards)
+    series = q_values(game._replace(gamma=game.gamma * beta), policies, expected + 0 * game.rewards)
+    return q_values(game, policies, game.rewards - expected + (1 - beta) * series)
+
+
 def values(game, policies):
     """V [S], from the chain over states alone."""
     joint = joint_policy(game, policies)
@@ -111,3 +118,7 @@ def all_episodes(game, policies, steps):
     for course, following in zip(courses, courses[1:]):
         probabilities = probabilities * game.transitions[(*course, following[0])]
     return courses[:, 0], courses[:, 1:].swapaxes(1, 2), probabilities
+
+
+def near(actual, desired, tolerance=1e-10):
+    np.testing.assert_allclose(actual, desired, rtol=0, atol=tolerance)

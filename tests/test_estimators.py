@@ -18,7 +18,7 @@ from dae_ros.rollout.in_process import train
 from dae_ros.run_folder import RunFolder
 from dae_ros.training import Training
 from dae_ros.worlds import make_worlds
-from tests.test_learner import COMA, LEARNER, REPLAY, REWARD, SPEC, parameters, random_trajectory, state_of
+from tests.learners import COMA, LEARNER, REPLAY, REWARD, SPEC, parameters, random_trajectory, state_of
 
 UNIT = strategies.one_of(strategies.sampled_from([0.0, 1.0]), strategies.floats(0, 1))
 

@@ -13,19 +13,8 @@ from dae_ros.rollout.assembler import Assembler
 from dae_ros.rollout.in_process import InProcessCollector
 from dae_ros.rollout.lockstep import AgentEnd, WorldEnd
 from dae_ros.types import Action, JointState, Observation, SharedReward
+from tests.learners import COMA, LEARNER, REWARD, SHARED_TRUNK, SPEC, assert_same_bits, parameters, random_trajectory, state_of
 from tests.played import POLICY, REQUEST, RUN, VERSION, A, Drifting, N, W, assert_same, play, refused, stamped
-from tests.test_learner import (  # noqa: F401
-    COMA,
-    LEARNER,
-    REWARD,
-    SHARED_TRUNK,
-    SPEC,
-    assert_same_bits,
-    make_learner,
-    parameters,
-    random_trajectory,
-    state_of,
-)
 
 LONG = REQUEST._replace(num_steps=24)
 
@@ -162,7 +151,7 @@ def thinned_trajectory(seed=0):
 @pytest.mark.parametrize('learner, reward', [(LEARNER, REWARD), (LEARNER, SHARED_TRUNK), (replace(LEARNER, beta=0.0), REWARD),
                                              (COMA, REWARD), (replace(COMA, estimator='coma_nstep', coma_steps=3), REWARD)],
                          ids=['dae', 'shared trunk', 'gae', 'coma', 'n-step coma'])
-def test_what_agents_that_have_left_observe_changes_no_bit_of_an_update(make_learner, learner, reward):  # noqa: F811
+def test_what_agents_that_have_left_observe_changes_no_bit_of_an_update(make_learner, learner, reward):
     trajectory = thinned_trajectory()
     assert 0.1 < 1 - trajectory.present.mean() < 0.9
     noise = np.random.default_rng(9).normal(size=trajectory.observations.shape).astype(np.float32)
@@ -176,7 +165,7 @@ def test_what_agents_that_have_left_observe_changes_no_bit_of_an_update(make_lea
     assert_same_bits(*after)
 
 
-def test_the_reward_that_agents_that_have_left_expect_is_the_one_that_came(make_learner):  # noqa: F811
+def test_the_reward_that_agents_that_have_left_expect_is_the_one_that_came(make_learner):
     trajectory = thinned_trajectory()
     expected = make_learner().expected_rewards(trajectory)
     rewards = np.broadcast_to(trajectory.rewards[..., None], expected.shape)
@@ -193,7 +182,7 @@ def test_means_and_deviations_are_of_those_present():
     assert advantages.mean_over_agents(numbers, torch.zeros_like(present)).flatten().tolist() == [0.0, 0.0]
 
 
-def test_masks_that_mask_nothing_change_an_update_by_rounding_at_most(make_learner):  # noqa: F811
+def test_masks_that_mask_nothing_change_an_update_by_rounding_at_most(make_learner):
     trajectory, after = random_trajectory(), []
     everything = np.ones(trajectory.probabilities.shape, bool)
     for rollout in (trajectory, trajectory._replace(available=everything, present=everything[..., 0])):
@@ -210,7 +199,7 @@ OWN = SPEC._replace(state_size=3 * 7, states_per_agent=True)
 PLAIN_MAPPO = replace(LEARNER, beta=0.0)
 
 
-def updated(make_learner, spec, data, settings=PLAIN_MAPPO):  # noqa: F811
+def updated(make_learner, spec, data, settings=PLAIN_MAPPO):
     """The state of a learner after one update."""
     learner = make_learner(settings, spec=spec)
     metrics = learner.update(data, 0)
@@ -223,7 +212,7 @@ def with_own_states(data, change=lambda states: states):
     return data._replace(states=copies[0].reshape(*data.states.shape[:2], -1), final_states=copies[1].reshape(-1, 3 * 7))
 
 
-def test_agents_that_all_have_the_teams_state_are_valued_as_the_team_is(make_learner):  # noqa: F811
+def test_agents_that_all_have_the_teams_state_are_valued_as_the_team_is(make_learner):
     data = random_trajectory(steps=12)
     team, team_metrics = updated(make_learner, SPEC, data)
     own, own_metrics = updated(make_learner, OWN, with_own_states(data))
@@ -233,7 +222,7 @@ def test_agents_that_all_have_the_teams_state_are_valued_as_the_team_is(make_lea
 
 
 @pytest.mark.parametrize('beta', [0.0, 0.9])
-def test_an_agents_advantages_depend_on_its_own_state_and_not_on_that_of_another(beta, make_learner):  # noqa: F811
+def test_an_agents_advantages_depend_on_its_own_state_and_not_on_that_of_another(beta, make_learner):
     def estimated(data):
         learner = make_learner(replace(LEARNER, beta=beta), spec=OWN)
         return learner._estimator.estimate(learner._tensors(data), 0).advantages.numpy().copy()
@@ -250,7 +239,7 @@ def test_an_agents_advantages_depend_on_its_own_state_and_not_on_that_of_another
         np.testing.assert_array_equal(before[..., :2], after[..., :2])
 
 
-def test_what_is_said_of_the_own_state_of_one_who_has_left_changes_no_weight(make_learner):  # noqa: F811
+def test_what_is_said_of_the_own_state_of_one_who_has_left_changes_no_weight(make_learner):
     data = random_trajectory(steps=12)
     present = np.ones(data.actions.shape, bool)
     left = np.zeros(len(data.states) - 1, bool)

@@ -8,7 +8,7 @@ from dae_ros.learning.learner import Learner
 from dae_ros.robots.task_monitor import TaskMonitor
 from dae_ros.rollout.streaming import StreamAssembler
 from dae_ros.types import Action, JointState, Observation, SharedReward
-from tests.test_learner import assert_same_bits, state_of
+from tests.learners import assert_same_bits, state_of
 from tests.test_streaming import FIRST, RUN, STEPS, TASK, Team
 
 HALVES = 2 * STEPS  # ticks of an episode
