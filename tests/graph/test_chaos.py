@@ -13,7 +13,7 @@ import time
 import pytest
 from dae_ros_msgs.msg import PolicyWeights, TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import SMALL, Listener, bringup, finish, oracle, pid_of, processes_naming
+from harness import SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of, processes_naming
 
 from dae_ros import config
 from dae_ros.report.metrics import read_metrics
@@ -27,6 +27,7 @@ UPDATES = 40
 VALUES = {**SMALL, 'total_steps': UPDATES * 8 * 25}
 KILLS = int(os.environ.get('CHAOS_KILLS', 5))
 SEED = int(os.environ.get('CHAOS_SEED', 1))
+LONG_EVALUATION = 100 * SMALL['num_worlds']  # episodes: seconds, since others may take that long to find a trainer started again
 ARRANGEMENTS = ({'world_groups': 2, 'robots_per_process': 2}, {}, {'robots_per_process': 1})
 
 
@@ -65,8 +66,8 @@ class Disturbed:
     def assert_ends_with(self, expected: tuple[str, float]) -> str:
         """The run ends by itself with this result and leaves everything it should and no process; what it said."""
         code, output, errors = finish(self.process)
-        logs = {path.stem: path.read_text() for path in (self.folder / 'logs').iterdir()}
-        assert code == 0, output + errors + '\n'.join(f'--- {name}\n{log[-3000:]}' for name, log in logs.items())
+        logs = self._logs()
+        assert code == 0, output + errors
         summary = Summary.read(self.folder / 'summary.json')
         assert (summary.weights_sha256, summary.evaluation_return) == expected
         assert 'Traceback' not in output + errors + ''.join(logs.values())
@@ -74,6 +75,17 @@ class Disturbed:
             200 * (update + 1) for update in range(self.updates)]
         assert not processes_naming(str(self.folder))
         return output
+
+    def end(self) -> None:
+        """Ends what is left of it and prints what was said, for a test that failed."""
+        self.process.kill()
+        if not self.process.stdout.closed:  # which the run was not waited for
+            print(*self.process.communicate(timeout=TIMEOUT))
+        for name, log in self._logs().items():
+            print(f'--- {name}\n{log[-3000:]}')
+
+    def _logs(self) -> dict[str, str]:
+        return {path.stem: path.read_text() for path in (self.folder / 'logs').iterdir()}
 
 
 @pytest.fixture
@@ -87,8 +99,7 @@ def disturb(domain, tmp_path):
 
     yield begin
     for run in runs:
-        run.process.kill()
-        run.process.communicate()
+        run.end()
 
 
 def victims(processes: list[str], kills: int, draw: random.Random) -> list[tuple[str, ...]]:
@@ -103,7 +114,7 @@ def test_the_run_ends_with_the_same_weights_whoever_is_killed_whenever(disturb, 
     """Kills when the training has come to versions drawn at random, and a moment later."""
     draw = random.Random(SEED)
     updates = max(UPDATES, 8 * KILLS)
-    arrangement = ARRANGEMENTS[SEED % len(ARRANGEMENTS)]
+    arrangement = {**ARRANGEMENTS[SEED % len(ARRANGEMENTS)], 'evaluation_episodes': LONG_EVALUATION}
     run, killed = disturb(updates, **arrangement), []
     with Listener() as listener:
         moments = sorted(draw.sample(range(updates - 3), KILLS - 1))
