@@ -44,6 +44,8 @@ SMALL = {'task': 'navigation', 'num_agents': 3, 'num_worlds': 8, 'num_steps': 25
          'reward_network.epochs': 2, 'reward_network.hidden_size': 16, 'reward_network.trunk_size': 16, 'hidden_size': 16,
          'evaluation_episodes': 8, 'rollout_timeout': 20.0}
 """Five updates of navigation with three robots."""
+LASTING = {**SMALL, 'evaluation_episodes': 800}
+"""Evaluated for seconds: a test that meddles with a run may take that long to hear of it, and must while it is on."""
 
 
 class Graph:

@@ -53,7 +53,7 @@ def test_battles_on_the_graph_end_with_the_weights_of_the_in_process_run_bit_for
 
 @pytest.mark.parametrize('nodes', [['world'], ['agents_0-4', 'trainer']], ids=' and '.join)
 def test_a_battle_whose_nodes_are_killed_is_begun_anew_and_changes_no_weight(nodes, domain, tmp_path):
-    values = {**SKIRMISH, 'total_steps': 12 * 8 * 25}
+    values = {**SKIRMISH, 'total_steps': 40 * 8 * 25}
     expected, folder = oracle(tmp_path / 'alone', values), tmp_path / 'graph'
     process = bringup(folder, values)
     deadline = time.monotonic() + TIMEOUT

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of, processes_naming
+from harness import LASTING, SMALL, TIMEOUT, Listener, bringup, finish, oracle, pid_of, processes_naming
 
 from dae_ros.report.metrics import read_metrics
 from dae_ros.report.summary import Summary
@@ -67,7 +67,7 @@ def test_an_interrupted_run_stops_every_process(number, long_run, tmp_path):
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint_to_the_same_weights(domain, tmp_path):
-    values = {**SMALL, 'total_steps': 60 * 8 * 25, 'checkpoint_interval': 5}
+    values = {**LASTING, 'total_steps': 60 * 8 * 25, 'checkpoint_interval': 5}
     process = bringup(tmp_path / 'run', values)
     with Listener() as listener:
         listener.wait_for_status(lambda status: status.policy_version >= 7)

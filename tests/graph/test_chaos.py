@@ -13,7 +13,7 @@ import time
 import pytest
 from dae_ros_msgs.msg import PolicyWeights, TrainingStatus
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import SMALL, Listener, bringup, finish, oracle, pid_of, processes_naming
+from harness import LASTING, Listener, bringup, finish, oracle, pid_of, processes_naming
 
 from dae_ros import config
 from dae_ros.report.metrics import read_metrics
@@ -24,8 +24,7 @@ from dae_ros.run_folder import RunFolder
 from dae_ros.weights.codec import decode_policy
 
 UPDATES = 40
-# Evaluated for seconds: others may take that long to find a trainer that is started again, and must while it runs.
-VALUES = {**SMALL, 'total_steps': UPDATES * 8 * 25, 'evaluation_episodes': 800}
+VALUES = {**LASTING, 'total_steps': UPDATES * 8 * 25}
 KILLS = int(os.environ.get('CHAOS_KILLS', 5))
 SEED = int(os.environ.get('CHAOS_SEED', 1))
 ARRANGEMENTS = ({'world_groups': 2, 'robots_per_process': 2}, {}, {'robots_per_process': 1})

@@ -7,7 +7,7 @@ from array import array
 
 from dae_ros_msgs import msg, srv
 from fuzzer import EXTREMES, HOSTILE_TEXTS, Fuzzer
-from harness import SMALL, TIMEOUT, Listener, Refusals, bringup, finish, oracle, processes_naming
+from harness import LASTING, TIMEOUT, Listener, Refusals, bringup, finish, oracle, processes_naming
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.qos import QoSProfile
@@ -123,7 +123,7 @@ def learnt(status: msg.TrainingStatus) -> int:
 
 
 def test_a_team_among_hostile_messages_counts_and_survives_them_all_and_ends_with_the_same_weights(domain, tmp_path):
-    values = {**SMALL, 'total_steps': UPDATES * W * 25, 'rollout_timeout': 5.0}
+    values = {**LASTING, 'total_steps': UPDATES * W * 25, 'rollout_timeout': 5.0}
     key_file = tmp_path / 'team.key'
     key_file.touch(0o600)
     key_file.write_bytes(KEY)

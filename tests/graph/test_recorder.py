@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 import yaml
-from harness import REPOSITORY, SMALL, Listener, Recorder, begin_alone, oracle
+from harness import LASTING, REPOSITORY, SMALL, Listener, Recorder, begin_alone, oracle
 from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
 
@@ -54,7 +54,7 @@ def test_a_recorded_run_holds_every_message_and_its_trajectories_bit_for_bit(par
 
 
 def test_a_recorder_killed_and_started_again_disturbs_nothing_and_both_bags_are_read_as_one(make_graph, tmp_path):
-    values = {**SMALL, 'total_steps': 40 * 8 * 25}
+    values = {**LASTING, 'total_steps': 40 * 8 * 25}
     graph = make_graph(tmp_path / 'graph', values)
     with Listener() as listener:
         first, second = (Recorder(graph, listener, tmp_path / 'bags' / name, name) for name in ('first', 'second'))

@@ -118,7 +118,7 @@ def test_odometry_that_cannot_be_right_stops_the_robot_and_so_do_a_dead_agent_an
             stage.start_driving(1, 0, 1, 2)
         processes.end('agent_1', signal.SIGKILL)
         stage.wait_for_words('bridge_1', 'the agent has not answered', 0, 1, 2)
-        assert is_standing(stage.commands[1][-1])
+        stage.spin_until(lambda: is_standing(stage.commands[1][-1]))
         processes.node('agent', 'agent_1_again', robot=1, policy_file=POLICY)
         stage.start_driving(1, 0, 1, 2)
         assert processes.end('bridge_1') == 0
