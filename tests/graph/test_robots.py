@@ -19,7 +19,7 @@ from harness import REPOSITORY, SMALL, TIMEOUT, processes_naming
 from nav_msgs.msg import Odometry
 from robots import LANDMARKS, PERIOD, PLACES, POLICY, Processes, Stage, is_standing
 from std_srvs.srv import SetBool, Trigger
-from visualization_msgs.msg import MarkerArray
+from visualization_msgs.msg import Marker, MarkerArray
 
 from dae_ros.report.summary import Summary
 from dae_ros.robots import standard_messages
@@ -238,7 +238,7 @@ def test_our_simulator_plays_robots_that_the_same_bridges_drive(domain, stage, p
 
     stage.spin_until(lambda: len(odometry) == 3 and landmarks and distance() < CLOSE)
     # The first displays may be older than the first action: the world listens to these once somebody looks.
-    stage.spin_until(lambda: shown and any(marker.ns == 'actions' and marker.action == marker.ADD for marker in shown[-1].markers))
+    stage.spin_until(lambda: shown and ('actions', Marker.ADD) in {(marker.ns, marker.action) for marker in shown[-1].markers})
     kinds = Counter(marker.ns for marker in shown[-1].markers)
     assert kinds == {'robots': 3, 'headings': 3, 'landmarks': 3, 'targets': 3, 'trails': 3, 'contacts': 1, 'actions': 12}
     assert stage.call(Trigger, 'robots/next_episode', Trigger.Request()).message == 'episode 1'
