@@ -96,7 +96,7 @@ def test_a_training_goes_on_to_the_same_weights_when_the_clock_is_set_back_by_an
                 listener.spin_until(lambda: shown == dict.fromkeys(nodes, hours), lambda: str(shown))
                 if killed and hours:
                     os.kill(pid_of(killed, folder.path), signal.SIGKILL)
-                    version = max(int(path.stem[-8:]) for path in folder.checkpoints.iterdir())
+                    version = max(int(path.stem[-8:]) for path in folder.checkpoints.glob('checkpoint_*'))
                     listener.wait_for_status(lambda status: status.policy_version >= min(version + 5, UPDATES))
         code, output, errors = finish(process)
     finally:

@@ -14,6 +14,7 @@ from harness import LASTING, REPOSITORY, SMALL, Listener, Recorder, begin_alone,
 from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
 
+from dae_ros.errors import BagError
 from dae_ros.replay.dataset import Dataset
 from dae_ros.rollout.in_process import train
 from dae_ros.ros import names
@@ -29,6 +30,14 @@ def trajectories(folder, values):
     train(training, worlds, lambda: None)
     training.close()
     return seen
+
+
+def holds_rollouts(bag) -> bool:
+    """Whether some can be read, from a bag that is still being written."""
+    try:
+        return bool(list(Dataset(bag)))
+    except BagError:
+        return False
 
 
 @pytest.mark.parametrize('parameters, end', [
@@ -61,7 +70,7 @@ def test_a_recorder_killed_and_started_again_disturbs_nothing_and_both_bags_are_
         for service in names.PAUSE, names.RESUME:
             listener.client(Trigger, service)
         graph.start(*(name for name in graph.names if name != 'second'))
-        listener.spin_until(lambda: int(first.values.get('messages', 0)) > 3 * 150, lambda: graph.log('first'))
+        listener.spin_until(lambda: holds_rollouts(tmp_path / 'bags' / 'first'), lambda: f'{first.values} {graph.log("first")}')
         graph.kill('first')
         assert listener.call(Trigger, names.PAUSE, Trigger.Request()).success
         graph.start('second')
