@@ -108,7 +108,7 @@ class Records:
         write_atomically(self._file(run), _encoded(own).encode())
 
     def _record(self, run: Run) -> Record | None:
-        return next((record for record in (self._in_folder(run), self._in_file(run)) if record and record.covers(run)), None)
+        return next((record for read in (self._in_file, self._in_folder) if (record := read(run)) and record.covers(run)), None)
 
     def _in_folder(self, run: Run) -> Record | None:
         path = self.path(run)
