@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from harness import SMALL, Graph, Listener, bringup, finish, oracle, processes_naming
+from harness import LASTING, SMALL, Graph, Listener, bringup, finish, oracle, processes_naming
 from std_srvs.srv import Trigger
 
 from dae_ros.ros import names, qos
@@ -49,8 +49,9 @@ def test_a_second_run_in_the_same_folder_says_so_and_ends_and_the_first_has_its_
 
 @pytest.fixture
 def two_trainings(make_graph, tmp_path):
-    """Two graphs in one namespace whose nodes join the run they hear of first, as those started by hand do."""
-    graphs = [make_graph(tmp_path / name, {**SMALL, 'seed': seed}) for seed, name in enumerate(('first', 'second'))]
+    """Two graphs in one namespace whose nodes join the run they hear of first, as those started by hand do. Both last, or one could
+    be over before the other begins."""
+    graphs = [make_graph(tmp_path / name, {**LASTING, 'seed': seed}) for seed, name in enumerate(('first', 'second'))]
     for graph in graphs:
         for process in graph.processes.values():
             process.parameters.pop('run', None)
@@ -65,7 +66,7 @@ def assert_one_wins(winner: Graph, loser: Graph, said: list[DiagnosticStatus], l
                                     for status in said), lambda: str({status.message for status in said}))
     served = list(folder.rglob(f'policies/{winner.folder.run:016x}/policy_{5:08d}.safetensors'))
     assert served and all(path.read_bytes() == winner.folder.policy_file.read_bytes() for path in served)
-    assert winner.result() == oracle(folder / 'alone', {**SMALL, 'seed': winner.settings.run.seed})
+    assert winner.result() == oracle(folder / 'alone', {**LASTING, 'seed': winner.settings.run.seed})
     assert not any('Traceback' in log.read_text() for log in folder.rglob('*.log'))
 
 
