@@ -49,8 +49,8 @@ def test_a_second_run_in_the_same_folder_says_so_and_ends_and_the_first_has_its_
 
 @pytest.fixture
 def two_trainings(make_graph, tmp_path):
-    """Two graphs in one namespace whose nodes join the run they hear of first, as those started by hand do. Both last, or one could
-    be over before the other begins."""
+    """Two graphs in one namespace whose nodes join the run they hear of first, as those started by hand do. Both last, or one
+    could be over before the other begins."""
     graphs = [make_graph(tmp_path / name, {**LASTING, 'seed': seed}) for seed, name in enumerate(('first', 'second'))]
     for graph in graphs:
         for process in graph.processes.values():
