@@ -108,6 +108,7 @@ class Records:
         write_atomically(self._file(run), _encoded(own).encode())
 
     def _record(self, run: Run) -> Record | None:
+        """The kept one first, so that a figure is the same wherever it is drawn."""
         return next((record for read in (self._in_file, self._in_folder) if (record := read(run)) and record.covers(run)), None)
 
     def _in_folder(self, run: Run) -> Record | None:

@@ -105,7 +105,7 @@ def test_bringup_has_the_trainer_tell_the_credit_of_the_world_it_is_asked_to_wat
         process = bringup(tmp_path / 'run', values, '--watch', str(WORLD))
         listener.spin_until(lambda: heard and np.isclose(time(heard[-1]), last) or process.poll() is not None)
         code, _, errors = finish(process)
-    assert code == 0 and heard, errors
+    assert code == 0 and len(heard) >= 2 * STEPS, f'{len(heard)} {errors}'
     np.testing.assert_allclose([time(message) for message in heard], last - 0.1 * np.arange(len(heard))[::-1])
     assert all(np.isnan(message.vector.y) and np.isfinite([message.vector.x, message.vector.z]).all() for message in heard)
 

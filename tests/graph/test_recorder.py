@@ -33,9 +33,9 @@ def trajectories(folder, values):
 
 
 def holds_rollouts(bag) -> bool:
-    """Whether some can be read, from a bag that is still being written."""
+    """Whether one can be read, from a bag that is still being written."""
     try:
-        return bool(list(Dataset(bag)))
+        return any(Dataset(bag))
     except BagError:
         return False
 
