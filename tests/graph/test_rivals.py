@@ -58,11 +58,8 @@ def two_trainings(make_graph, tmp_path):
     return graphs
 
 
-def assert_one_wins(graphs: list[Graph], said: list[DiagnosticStatus], listener: Listener, folder: Path) -> None:
-    """One training ends with its weights, all of them, and the other says on stderr and /diagnostics why it ends."""
-    codes = {graph: graph.wait() for graph in graphs}
-    assert sorted(codes.values()) == [0, 2], ''.join(graph.log('trainer') for graph in graphs)
-    winner, loser = sorted(codes, key=codes.__getitem__)
+def assert_one_wins(winner: Graph, loser: Graph, said: list[DiagnosticStatus], listener: Listener, folder: Path) -> None:
+    """One training ended with its weights, all of them, and the other said on stderr and /diagnostics why it ended."""
     sentence = f'another trainer is at work here: its run {winner.folder.run:x} has '
     assert f'error: {sentence}' in loser.log('trainer')
     listener.spin_until(lambda: any(status.level == DiagnosticStatus.ERROR and status.message.startswith(sentence)
@@ -94,7 +91,9 @@ def test_of_two_trainers_and_servers_started_at_once_one_has_its_own_weights_and
         for graph in two_trainings:
             graph.start(node)
     two_trainings[0].start('world', 'agents_0-2')
-    assert_one_wins(two_trainings, said, listener, tmp_path)
+    codes = {graph: graph.wait() for graph in two_trainings}
+    assert sorted(codes.values()) == [0, 2], ''.join(graph.log('trainer') for graph in two_trainings)
+    assert_one_wins(*sorted(codes, key=codes.__getitem__), said, listener, tmp_path)
 
 
 def test_a_team_of_which_each_of_two_trainers_has_a_part_becomes_that_of_one_and_acts_with_no_policy_of_the_other(
@@ -106,4 +105,5 @@ def test_a_team_of_which_each_of_two_trainers_has_a_part_becomes_that_of_one_and
     first.start('trainer', 'world', 'agents_0-2')
     listener.spin_until(lambda: any(status.message == 'waiting for actions of robots [0, 1, 2]' for status in said))
     os.kill(second.pids['trainer'], signal.SIGCONT)
-    assert_one_wins(two_trainings, said, listener, tmp_path)
+    assert (first.wait(), second.wait()) == (0, 2), first.log('trainer') + second.log('trainer')
+    assert_one_wins(first, second, said, listener, tmp_path)
